@@ -1,0 +1,1 @@
+"""Pipelines: samples in, steps out. No files, no Rerun, no printing."""

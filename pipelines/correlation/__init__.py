@@ -1,0 +1,1 @@
+"""Two-fragment correlation odometry for a downward camera (papers A and A0)."""

@@ -1,0 +1,73 @@
+"""What every estimator is: a pure step function from samples to records of all that it computed.
+
+A `Step` class is a frozen slotted dataclass whose fields are declared with `quantity`, so that each
+carries its unit, its shape and its meaning. That declaration is the list of intermediates: a new one
+is one field there and one row in `workbench/schema.py`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, Protocol, TypeVar
+
+from pydantic import BaseModel
+
+from pipelines.verdict import Verdict
+from readers.streams import Sample, StreamKind
+
+StateT = TypeVar("StateT")
+
+
+def quantity(unit: str, meaning: str, *shape: int | str) -> Any:
+    """Declare a field of a Step: its unit (SI or px, ``1`` for none), what it is, and its shape.
+
+    A letter in the shape stands for a length that the settings decide.
+    """
+    return dataclasses.field(metadata={"unit": unit, "meaning": meaning, "shape": shape})
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Step:
+    """What every estimator says about a frame; estimators add their own fields.
+
+    `frame` is the number of the frame within the recording's image stream (0, 1, …), whatever the
+    window or stride of the replay.
+    """
+
+    frame: int = quantity("1", "number of the frame in its stream")
+    t_ns: int = quantity("ns", "sensor time of the frame")
+    received_ns: int = quantity("ns", "log time of the frame")
+    verdict: Verdict = quantity("1", "gravest of the alarms")
+    alarms: Verdict = quantity("1", "every check that did not pass, as flags")
+
+
+class Estimator(Protocol[StateT]):
+    """An estimator as the replay sees it.
+
+    `name` is the name of the command line, `settings` the frozen model that is saved beside the result,
+    `step_type` the class of its steps, `kinds` the kinds of samples that it can use.
+    """
+
+    name: ClassVar[str]
+    step_type: ClassVar[type[Step]]
+    kinds: ClassVar[tuple[StreamKind, ...]]
+
+    @property
+    def settings(self) -> BaseModel:
+        """The frozen settings of this estimator."""
+        ...
+
+    def start(self) -> StateT:
+        """The state before the first sample."""
+        ...
+
+    def step(self, state: StateT, sample: Sample, /) -> tuple[StateT, Step | None]:
+        """Take one sample; return the new state, and a Step where the sample was a frame."""
+        ...
+
+
+def quantities(step_type: type[Step]) -> Mapping[str, Mapping[str, Any]]:
+    """The declared fields of a Step class: name → unit, meaning, shape."""
+    return {f.name: dict(f.metadata) for f in dataclasses.fields(step_type)}

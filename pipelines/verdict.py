@@ -1,0 +1,116 @@
+"""What became of a step: each verdict with its sentence.
+
+A bad measurement is a verdict, a bad call an exception. A step has one `verdict`, the gravest of
+its `alarms`; the alarms are a set of flags, so that nothing that was noticed is lost.
+"""
+
+from __future__ import annotations
+
+import enum
+import functools
+
+
+class Severity(enum.IntEnum):
+    """How much a verdict should worry the reader."""
+
+    FINE = 0
+    NOTICE = 1
+    WARNING = 2
+    ERROR = 3
+
+
+class Verdict(enum.IntFlag):
+    """The outcome of one step; values are stable and are written into recordings.
+
+    The order of gravity is that of the severities, then of the values.
+    """
+
+    OK = 0
+    FIRST_FRAME = 1 << 0
+    REACQUIRED = 1 << 1
+    CORRECTION_APPLIED = 1 << 2
+    DUPLICATE_FRAME = 1 << 3
+    FRAME_GAP = 1 << 4
+    HEIGHT_CHANGE = 1 << 5
+    EXPOSURE_JUMP = 1 << 6
+    BLURRED = 1 << 7
+    PEAK_AMBIGUOUS = 1 << 8
+    PEAK_AT_BORDER = 1 << 9
+    LOW_CORRELATION = 1 << 10
+    LOW_TEXTURE = 1 << 11
+    APERTURE = 1 << 12
+    RESIDUAL_HIGH = 1 << 13
+    ROTATION_BEYOND_LIMIT = 1 << 14
+    SUBPIXEL_DIVERGED = 1 << 15
+    SEARCH_OUTSIDE_IMAGE = 1 << 16
+    NOT_RIGID = 1 << 17
+    TOO_FEW_INLIERS = 1 << 18
+    OUT_OF_ORDER = 1 << 19
+    SIZE_CHANGED = 1 << 20
+    UNDECODABLE = 1 << 21
+    LOST = 1 << 22
+
+    @property
+    def sentence(self) -> str:
+        """What this verdict says, in words, for one flag."""
+        return _SENTENCES[self]
+
+    @property
+    def severity(self) -> Severity:
+        """How grave this verdict is, for one flag."""
+        return _SEVERITIES.get(self, Severity.WARNING)
+
+
+_SENTENCES: dict[Verdict, str] = {
+    Verdict.OK: "every check passed",
+    Verdict.FIRST_FRAME: "first frame: nothing to compare with yet",
+    Verdict.REACQUIRED: "position found again by the global search",
+    Verdict.CORRECTION_APPLIED: "a segment's correction was applied",
+    Verdict.DUPLICATE_FRAME: "the frame repeats the one before it, pixel by pixel",
+    Verdict.FRAME_GAP: "frames are missing: the time since the last one is a multiple of the usual",
+    Verdict.HEIGHT_CHANGE: "the matches lie closer together or further apart than the fragments: the height changed",
+    Verdict.EXPOSURE_JUMP: "brightness changed between the frames (gain or offset of the match)",
+    Verdict.BLURRED: "gradient energy fell below its running median: the frame is blurred",
+    Verdict.PEAK_AMBIGUOUS: "the second correlation peak is nearly as high as the first",
+    Verdict.PEAK_AT_BORDER: "the correlation peak lies at the border of the search area",
+    Verdict.LOW_CORRELATION: "the correlation peak is low",
+    Verdict.LOW_TEXTURE: "the fragment has too little texture for a shift to be told",
+    Verdict.APERTURE: "the texture is striped: the shift along the stripes is uncertain",
+    Verdict.RESIDUAL_HIGH: "what remains after matching is far above its running median",
+    Verdict.ROTATION_BEYOND_LIMIT: "the rotation between frames is beyond the limit of (1) for this fragment size",
+    Verdict.SUBPIXEL_DIVERGED: "the subpixel step is longer than its limit: the system is ill-conditioned",
+    Verdict.SEARCH_OUTSIDE_IMAGE: "a search area lies outside the image",
+    Verdict.NOT_RIGID: "the fragments' shifts do not fit one rigid motion",
+    Verdict.TOO_FEW_INLIERS: "too few fragments agree on a motion",
+    Verdict.OUT_OF_ORDER: "the frame's stamp does not lie after the one before it; the frame was skipped",
+    Verdict.SIZE_CHANGED: "the image size differs from that of the frame before",
+    Verdict.UNDECODABLE: "the image could not be decoded",
+    Verdict.LOST: "no position: the last velocity is held until the global search succeeds",
+}
+
+_SEVERITIES: dict[Verdict, Severity] = {
+    Verdict.OK: Severity.FINE,
+    Verdict.FIRST_FRAME: Severity.NOTICE,
+    Verdict.REACQUIRED: Severity.NOTICE,
+    Verdict.CORRECTION_APPLIED: Severity.FINE,
+    Verdict.NOT_RIGID: Severity.ERROR,
+    Verdict.TOO_FEW_INLIERS: Severity.ERROR,
+    Verdict.OUT_OF_ORDER: Severity.ERROR,
+    Verdict.SIZE_CHANGED: Severity.ERROR,
+    Verdict.UNDECODABLE: Severity.ERROR,
+    Verdict.LOST: Severity.ERROR,
+}
+
+
+@functools.cache
+def flags(alarms: Verdict) -> tuple[Verdict, ...]:
+    """The single flags of a set of alarms, gravest first; empty for `Verdict.OK`."""
+    single = [v for v in Verdict if v in alarms]
+    return tuple(sorted(single, key=lambda v: (v.severity, v.value), reverse=True))
+
+
+@functools.cache
+def gravest(alarms: Verdict) -> Verdict:
+    """The gravest single flag of a set of alarms, `Verdict.OK` for the empty set."""
+    single = flags(alarms)
+    return single[0] if single else Verdict.OK

@@ -1,0 +1,115 @@
+"""Time: sane stamps, merging by time, and the oddities of a stream's clock, counted.
+
+All times are integer nanoseconds.
+"""
+
+from __future__ import annotations
+
+import heapq
+import statistics
+from collections import Counter
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from readers.streams import Fact, ImageSample, Problem, Sample
+
+SECOND_NS = 1_000_000_000
+DAY_NS = 86_400 * SECOND_NS
+REORDER_WINDOW_NS = SECOND_NS
+GAP_FACTOR = 2.5
+
+
+def sane_stamp(header_ns: int, received_ns: int) -> bool:
+    """Whether a header stamp can be the sensor's time of a message that was logged at `received_ns`.
+
+    A stamp of zero, or one more than a day away from the log time, is of another epoch.
+    """
+    return header_ns > 0 and abs(header_ns - received_ns) <= DAY_NS
+
+
+def reorder(samples: Iterable[Sample], window_ns: int = REORDER_WINDOW_NS) -> Iterator[Sample]:
+    """Bring samples that come in log order into the order of `t_ns`, within a bounded delay.
+
+    A sample waits until the log is `window_ns` further than its own stamp; one that comes later than
+    that is passed on at once, out of order, and `StreamAudit` counts it.
+    """
+    heap: list[tuple[int, int, Sample]] = []
+    for number, sample in enumerate(samples):
+        heapq.heappush(heap, (sample.t_ns, number, sample))
+        horizon = sample.received_ns - window_ns
+        while heap and heap[0][0] <= horizon:
+            yield heapq.heappop(heap)[2]
+    while heap:
+        yield heapq.heappop(heap)[2]
+
+
+def merge(*sources: Iterable[Sample]) -> Iterator[Sample]:
+    """Merge sources that are each in the order of `t_ns`; equal stamps keep the order of the sources."""
+    return heapq.merge(*sources, key=lambda sample: sample.t_ns)
+
+
+@dataclass(slots=True)
+class StreamAudit:
+    """Counts what is odd in one stream while its samples pass by in the order of reading.
+
+    Feed every sample to `add`, then read `facts()`. Memory: 16 bytes a sample.
+    """
+
+    stream: str
+    counts: Counter[str] = field(default_factory=Counter)
+    first_ns: int = -1
+    last_ns: int = -1
+    samples: int = 0
+    longest_gap_ns: int = 0
+    _steps_ns: list[int] = field(default_factory=list)
+    _size: tuple[int, int] = (0, 0)
+
+    def add(self, sample: Sample) -> None:
+        """Take note of the next sample of this stream."""
+        self.samples += 1
+        if isinstance(sample, Problem):
+            self.counts["undecodable"] += 1
+            return
+        if self.last_ns >= 0:
+            step = sample.t_ns - self.last_ns
+            if step < 0:
+                self.counts["out_of_order"] += 1
+            elif step == 0:
+                self.counts["duplicate_stamp"] += 1
+            else:
+                self._steps_ns.append(step)
+        else:
+            self.first_ns = sample.t_ns
+        self.last_ns = max(self.last_ns, sample.t_ns)
+        quat = getattr(sample, "quat_xyzw", None)
+        if quat is not None and not np.any(quat):
+            self.counts["zero_quaternion"] += 1
+        if isinstance(sample, ImageSample) and sample.width_px:
+            size = (sample.width_px, sample.height_px)
+            if self._size not in ((0, 0), size):
+                self.counts["size_change"] += 1
+            self._size = size
+
+    def facts(self) -> tuple[Fact, ...]:
+        """The oddities met so far, each with its count and a sentence."""
+        found = dict(self.counts)
+        if len(self._steps_ns) >= 3:
+            usual = statistics.median(self._steps_ns)
+            gaps = [s for s in self._steps_ns if s > GAP_FACTOR * usual]
+            if gaps:
+                found["gap"] = len(gaps)
+                self.longest_gap_ns = max(gaps)
+        sentences = {
+            "undecodable": "messages could not be decoded",
+            "out_of_order": "stamps lie before an earlier one",
+            "duplicate_stamp": "stamps repeat the one before",
+            "zero_quaternion": "quaternions are all zero and were read as unknown",
+            "size_change": "images differ in size from the one before",
+            "gap": f"gaps are longer than {GAP_FACTOR:g} usual steps, the longest {self.longest_gap_ns / 1e9:.3f} s",
+        }
+        return tuple(
+            Fact(stream=self.stream, code=code, count=n, sentence=f"{n} {sentences[code]}")
+            for code, n in sorted(found.items())
+        )

@@ -1,0 +1,1 @@
+"""The workbench: steps into Rerun recordings, run folders, summaries and the command line."""
