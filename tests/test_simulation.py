@@ -1,0 +1,375 @@
+"""The simulator: its scene is what it says, without interpolation bias, with the right signs."""
+
+import functools
+
+import cv2
+import numpy as np
+import pytest
+import scipy.ndimage
+from recordings_dir import RECORDINGS
+
+from pipelines.geometry import heading_of_quat
+from pipelines.simulation import mission as sim
+from pipelines.simulation import trajectories as ways
+from pipelines.simulation.mission import SimulatedMission, nadir_camera
+from pipelines.simulation.render import Patch, expose, noise_key_of, radiance, world_h_pixel
+from pipelines.simulation.surfaces import (
+    PSF_SIGMA_PX,
+    Surface,
+    gravel,
+    surface_from_image,
+    surface_from_periodic,
+    tiles,
+)
+from readers.streams import ImageSample, PoseSample, RangeSample, StreamError
+
+W = sim.PAPER_HEIGHT_M / sim.PAPER_FOCAL_PX
+WAVES = ((40, 3, 5, 0.3), (25, -7, 2, 1.1), (15, 11, 9, 2.0))  # amplitude, cycles in x and y, phase
+PERIOD = 256
+
+
+@functools.cache
+def paper_surface(name: str = "b_01") -> Surface:
+    picture = cv2.imread(str(RECORDINGS / "paper_a_surface_frames" / f"{name}.png"))
+    assert picture is not None, "the shared recordings are missing"
+    return surface_from_image(picture.astype(float) @ [0.114, 0.587, 0.299])
+
+
+@functools.cache
+def sinusoids() -> Surface:
+    rows, columns = np.mgrid[:PERIOD, :PERIOD]
+    return surface_from_periodic(analytic_scene(columns, rows, psf_sigma_px=0))
+
+
+def analytic_scene(x_px: np.ndarray, y_px: np.ndarray, psf_sigma_px: float = PSF_SIGMA_PX) -> np.ndarray:
+    """The scene at picture coordinates (columns, rows), in closed form."""
+    grey = np.full(np.broadcast(x_px, y_px).shape, 120.0)
+    for amplitude, fx, fy, phase in WAVES:
+        wx, wy = 2 * np.pi * fx / PERIOD, 2 * np.pi * fy / PERIOD
+        attenuation = np.exp(-0.5 * psf_sigma_px**2 * (wx**2 + wy**2))
+        grey += amplitude * attenuation * np.cos(wx * x_px + wy * y_px + phase)
+    return grey
+
+
+def see(surface: Surface, pose: tuple[float, float, float], side: int = 512, **tilt: float) -> np.ndarray:
+    matrix = nadir_camera(side, side).matrix
+    return radiance(surface, world_h_pixel(np.array(pose), matrix, sim.PAPER_HEIGHT_M, **tilt), (side, side))
+
+
+# -------------------------------------------------------------------------------- the scene
+
+
+@pytest.mark.parametrize("pose", [(0.0, 0.0, 0.0), (0.731, -0.233, 0.9), (-12.3, 45.6, -2.5)])
+def test_frames_are_the_analytic_scene(pose: tuple[float, float, float]) -> None:
+    side, (x, y, heading) = 200, pose
+    v, u = np.mgrid[:side, :side] - (side - 1) / 2
+    world_x = x + W * (np.cos(heading) * u + np.sin(heading) * v)  # v to the right: minus y at heading 0
+    world_y = y + W * (np.sin(heading) * u - np.cos(heading) * v)
+    expected = analytic_scene(world_x / W, -world_y / W)
+    # the cubic spline itself is good to (ω/2)⁴/… of an amplitude at twice the resolution
+    np.testing.assert_allclose(see(sinusoids(), pose, side), expected, atol=3e-3)
+
+
+def test_forward_motion_shifts_the_content_backwards() -> None:
+    before, after = see(sinusoids(), (0.0, 0.0, 0.0)), see(sinusoids(), (7 * W, 0.0, 0.0))
+    np.testing.assert_allclose(after[:, :-7], before[:, 7:], atol=1e-2)
+
+
+def test_motion_to_the_left_shifts_the_content_down() -> None:
+    before, after = see(sinusoids(), (0.0, 0.0, 0.0)), see(sinusoids(), (0.0, 5 * W, 0.0))
+    np.testing.assert_allclose(after[5:], before[:-5], atol=1e-2)
+
+
+def test_a_left_turn_turns_the_content_clockwise_on_the_screen() -> None:
+    before, after = see(sinusoids(), (0.1, 0.2, 0.0)), see(sinusoids(), (0.1, 0.2, np.pi / 2))
+    np.testing.assert_allclose(after, np.rot90(before, k=-1), atol=1e-2)
+
+
+def test_roll_and_pitch_follow_the_right_hand() -> None:
+    k = nadir_camera().matrix
+    nose_down = world_h_pixel(np.zeros(3), k, 0.2, pitch_rad=0.1) @ [255.5, 255.5, 1]
+    left_up = world_h_pixel(np.zeros(3), k, 0.2, roll_rad=0.1) @ [255.5, 255.5, 1]
+    np.testing.assert_allclose(nose_down[:2] / nose_down[2], [-0.2 * np.tan(0.1), 0], atol=1e-12)
+    np.testing.assert_allclose(left_up[:2] / left_up[2], [0, 0.2 * np.tan(0.1)], atol=1e-12)
+
+
+def test_a_camera_below_the_ground_is_refused() -> None:
+    with pytest.raises(ValueError, match="above the ground"):
+        world_h_pixel(np.zeros(3), np.eye(3), 0.0)
+
+
+# ------------------------------------------------------------------------- no bias (A4)
+
+
+def quintic_shift_error(before: np.ndarray, after: np.ndarray, shift_px: float) -> float:
+    """Shift along u by least squares on a quintic spline, 212 x 212 window, minus the true one."""
+    side, edge = 212, 22
+    rows, columns = np.mgrid[edge : edge + side, edge : edge + side].astype(float)
+    template = before[edge : edge + side, edge : edge + side].ravel()
+    spline = scipy.ndimage.spline_filter(after.astype(float), order=5, mode="mirror")
+    sample = functools.partial(scipy.ndimage.map_coordinates, spline, order=5, prefilter=False, mode="mirror")
+    d = np.array([shift_px, 0.0])
+    eps = 0.25
+    for _ in range(4):
+        here, right, left, below, above = (
+            sample([rows + d[1] + dy, columns + d[0] + dx])
+            for dx, dy in ((0, 0), (eps, 0), (-eps, 0), (0, eps), (0, -eps))
+        )
+        jacobian = np.stack([right - left, below - above], axis=-1).reshape(-1, 2) / (2 * eps)
+        d += np.linalg.lstsq(jacobian, template - here.ravel(), rcond=None)[0]
+    return float(d[0] - shift_px)
+
+
+def test_a4_render_bias() -> None:
+    fractions = np.arange(8) / 8
+    before = see(paper_surface(), (0.0, 0.0, 0.0), 256)
+    errors = [
+        quintic_shift_error(before, see(paper_surface(), (-shift * W, 0.0, 0.0), 256), shift) for shift in fractions
+    ]
+    s_curve = 2 * np.mean(errors * np.sin(2 * np.pi * fractions))
+    assert abs(s_curve) <= 0.8e-3
+    assert np.max(np.abs(errors)) <= 0.8e-3
+
+
+# ------------------------------------------------------------------------------ the sensor
+
+
+def test_noise_is_white_of_the_right_size_and_belongs_to_its_frame() -> None:
+    flat = np.full((512, 512), 100.25, dtype=np.float32)
+    frames = [expose(flat, noise_key=noise_key_of(3, k), noise_grey=2).astype(float) - 100.25 for k in range(4)]
+    n = flat.size
+    for noise in frames:
+        assert abs(noise.mean()) < 5 * 2 / np.sqrt(n)
+        assert noise.std() == pytest.approx(np.sqrt(4 + 1 / 12), rel=0.01)
+        for lag in range(1, 9):
+            r = np.mean(noise.ravel()[lag:] * noise.ravel()[:-lag]) / noise.var()
+            assert abs(r) < 5 / np.sqrt(n)
+    assert np.max(np.abs(np.corrcoef([f.ravel() for f in frames]) - np.eye(4))) < 5 / np.sqrt(n)
+
+
+def test_gain_offset_vignetting_and_clipping() -> None:
+    flat = np.full((5, 5), 100, dtype=np.float32)
+    assert np.all(expose(flat, noise_key=1, gain=1.5, offset_grey=7) == 157)
+    assert np.all(expose(flat, noise_key=1, gain=3.0) == 255)
+    assert np.all(expose(flat, noise_key=1, gain=-1.0) == 0)
+    dark = expose(flat, noise_key=1, vignetting=0.6)
+    assert (dark[2, 2], dark[0, 0], dark[2, 4]) == (100, 40, 70)
+
+
+# -------------------------------------------------------------------------------- surfaces
+
+
+def test_surfaces_refuse_what_is_no_picture() -> None:
+    with pytest.raises(ValueError, match="finite grey levels"):
+        surface_from_image(np.zeros((4, 4, 3)))
+    with pytest.raises(ValueError, match="must be even"):
+        surface_from_periodic(np.zeros((5, 4)))
+
+
+def test_surface_of_an_image_is_seamless_and_mirrored() -> None:
+    surface = paper_surface()
+    assert surface.period_m == pytest.approx((1024 * W, 1024 * W))
+    at_edge = see(surface, (512 * W, -256 * W, 0.0), 64)  # the picture's right border lies in the middle
+    np.testing.assert_allclose(at_edge, see(surface, (511 * W, -256 * W, 0.0), 64)[:, ::-1], atol=0.05)
+
+
+@pytest.mark.parametrize("make", [lambda rng: gravel(256, rng), lambda rng: tiles(32, rng)], ids=["gravel", "tiles"])
+def test_procedural_surfaces_are_seeded_and_periodic(make) -> None:
+    surface, again, other = (make(np.random.default_rng(seed)) for seed in (1, 1, 2))
+    assert np.array_equal(surface.coefficients, again.coefficients)
+    assert not np.array_equal(surface.coefficients, other.coefficients)
+    here = see(surface, (0.0, 0.0, 0.0), 128)
+    np.testing.assert_allclose(see(surface, (surface.period_m[0], 0.0, 0.0), 128), here, atol=1e-2)
+    np.testing.assert_allclose(see(surface, (0.0, surface.period_m[1], 0.0), 128), here, atol=1e-2)
+
+
+def test_gravel_has_the_contrast_of_gravel() -> None:
+    def gradient_rms(image: np.ndarray) -> float:
+        return float(np.sqrt(np.mean(np.gradient(image)[1] ** 2)))
+
+    ours, real = (see(s, (0.0, 0.0, 0.0)) for s in (gravel(512, np.random.default_rng(0)), paper_surface()))
+    assert gradient_rms(real) == pytest.approx(7.5, abs=0.7)
+    assert gradient_rms(ours) == pytest.approx(gradient_rms(real), rel=0.2)
+    assert np.mean((ours < 1) | (ours > 254)) < 0.01
+
+
+# ---------------------------------------------------------------------------- trajectories
+
+CURVES = {
+    "line": ways.line(0.4),
+    "circle": ways.circle(),
+    "eight": ways.figure_eight(),
+    "spiral": ways.spiral(),
+    "serpentine": ways.serpentine(),
+}
+
+
+@pytest.mark.parametrize("curve", CURVES.values(), ids=CURVES)
+def test_tangents_are_the_derivatives_of_the_points(curve: ways.Curve) -> None:
+    t, h = np.linspace(0.1, 7, 50), 1e-5
+    difference = (curve.point(t + h) - curve.point(t - h)) / (2 * h)
+    np.testing.assert_allclose(curve.tangent(t), difference, atol=1e-8)
+
+
+@pytest.mark.parametrize("curve", CURVES.values(), ids=CURVES)
+def test_arc_lengths_and_headings_are_exact(curve: ways.Curve) -> None:
+    lengths = np.random.default_rng(0).uniform(-0.005, 0.025, 300)
+    poses = ways.follow(curve, lengths)
+    # the same way in one piece, and in steps twenty times as short
+    np.testing.assert_allclose(ways.follow(curve, np.repeat(lengths / 20, 20))[::20], poses, atol=1e-11)
+    fine = ways.follow(curve, np.full(20000, lengths.sum() / 20000))
+    np.testing.assert_allclose(fine[-1], poses[-1], atol=1e-10)
+    chords = np.linalg.norm(np.diff(fine[:, :2], axis=0), axis=1).sum()
+    assert chords == pytest.approx(abs(lengths.sum()), rel=1e-7)
+    mid = (fine[:-1, 2] + fine[1:, 2]) / 2
+    step = np.diff(fine[:, :2], axis=0)
+    across = np.cos(mid) * step[:, 1] - np.sin(mid) * step[:, 0]
+    assert np.max(np.abs(across)) < 1e-9
+
+
+def test_a_drive_rises_from_standstill_to_its_speed() -> None:
+    poses = ways.drive(ways.figure_eight(), 2111, speed_mps=0.51, rng=np.random.default_rng(0))
+    speeds = 60 * np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
+    assert speeds[0] == 0
+    assert speeds[100:].mean() == pytest.approx(0.51, rel=0.03)
+    assert speeds[100:].std() == pytest.approx(0.051, rel=0.25)
+    assert np.all(np.abs(np.diff(poses[:, 2])) < 0.02)
+
+
+def test_fast_drives_have_slow_waves() -> None:
+    poses = ways.drive(ways.line(), 600, speed_mps=8 / 3.6, rng=np.random.default_rng(0), ramp_frames=0)
+    speeds = 60 * np.diff(poses[:, 0])
+    assert speeds.max() == pytest.approx(8 / 3.6 * 1.035, rel=1e-3)
+    assert np.abs(np.diff(speeds)).max() < 0.005
+
+
+def test_the_lever_moves_the_camera_ahead() -> None:
+    poses = ways.ahead(np.array([[1.0, 2.0, np.pi / 2]]), 0.1)
+    np.testing.assert_allclose(poses, [[1.0, 2.1, np.pi / 2]], atol=1e-15)
+
+
+def test_image_motion_integrates_to_the_poses() -> None:
+    poses = ways.drive(ways.spiral(), 400, speed_mps=0.5, rng=np.random.default_rng(1), lever_m=0.1)
+    shift, turn = ways.image_motion(poses, W)
+    pose = poses[0].copy()
+    for (u, v), delta in zip(shift, turn, strict=True):
+        pose[2] += delta
+        cos, sin = np.cos(pose[2]), np.sin(pose[2])
+        pose[:2] -= W * np.array([cos * u + sin * v, sin * u - cos * v])
+    np.testing.assert_allclose(pose, poses[-1], atol=1e-12)
+
+
+def test_image_motion_is_what_the_renderer_shows() -> None:
+    poses = np.array([[0.3, 0.1, 0.5], [0.3 + 6.3 * W, 0.1 - 3.1 * W, 0.55]])
+    (shift,), (turn,) = ways.image_motion(poses, W)
+    before, after = (see(sinusoids(), tuple(p), 201) for p in poses)
+    v, u = np.mgrid[:201, :201] - 100.0
+    p = np.stack([u, v], axis=-1)
+    clockwise = np.array([[np.cos(turn), -np.sin(turn)], [np.sin(turn), np.cos(turn)]])  # on the screen: +u to +v
+    source = (p - shift) @ clockwise + 100  # the inverse of moved = clockwise @ source + shift
+    seen = scipy.ndimage.map_coordinates(before.astype(float), [source[..., 1], source[..., 0]], order=5)
+    np.testing.assert_allclose(seen[40:-40, 40:-40], after[40:-40, 40:-40], atol=0.02)
+
+
+# --------------------------------------------------------------------------------- mission
+
+
+def small_mission(*faults: sim.Fault, n: int = 12, **settings: object) -> SimulatedMission:
+    poses = ways.follow(ways.circle(), np.full(n - 1, 0.008))
+    return SimulatedMission(sinusoids(), poses, camera=nadir_camera(64, 48), seed=5, faults=faults, **settings)
+
+
+def images(mission: SimulatedMission) -> dict[int, np.ndarray]:
+    samples = [s for s in mission.read([sim.IMAGE]) if isinstance(s, ImageSample)]
+    first = mission.truth_t_ns[0]
+    return {
+        round((s.t_ns - first) * 60 / 1e9): np.frombuffer(s.data, np.uint8).reshape(s.height_px, s.width_px)
+        for s in samples
+    }
+
+
+def test_any_frame_can_be_rendered_by_itself() -> None:
+    mission, again = small_mission(), small_mission()
+    in_order = images(mission)
+    for k in (7, 0, 11):
+        assert np.array_equal(again.frame(k), in_order[k])
+    assert not np.array_equal(small_mission().frame(0), SimulatedMission(sinusoids(), mission.truth_poses).frame(0))
+    with pytest.raises(IndexError, match="12 frames"):
+        mission.frame(12)
+
+
+def test_reading_is_merged_half_open_and_by_name() -> None:
+    mission = small_mission()
+    everything = list(mission.read())
+    assert len(everything) == 48
+    assert [s.t_ns for s in everything] == sorted(s.t_ns for s in everything)
+    some = list(mission.read([sim.POSE], int(mission.truth_t_ns[2]), int(mission.truth_t_ns[5])))
+    assert [s.t_ns for s in some] == mission.truth_t_ns[2:5].tolist()
+    assert {i.name: i.count for i in mission.streams} == dict.fromkeys([sim.IMAGE, sim.INFO, sim.POSE, sim.HEIGHT], 12)
+    assert mission.stream(sim.IMAGE).rate_hz == pytest.approx(60)
+    with pytest.raises(StreamError, match="/nowhere"):
+        mission.read(["/nowhere"])
+
+
+def test_the_reference_is_the_truth() -> None:
+    mission = small_mission(height_m=np.linspace(0.2, 0.21, 12))
+    poses = [s for s in mission.read([sim.POSE]) if isinstance(s, PoseSample)]
+    heights = [s for s in mission.read([sim.HEIGHT]) if isinstance(s, RangeSample)]
+    read_back = [[*p.position_m[:2], heading_of_quat(p.quat_xyzw)] for p in poses]
+    np.testing.assert_allclose(read_back, mission.truth_poses, atol=1e-14)
+    assert [h.range_m for h in heights] == [p.position_m[2] for p in poses] == np.linspace(0.2, 0.21, 12).tolist()
+    assert mission.metres_per_px == pytest.approx(0.205 / 256)
+
+
+def test_dropped_and_duplicate_frames() -> None:
+    clean = images(small_mission())
+    faulty = images(small_mission(sim.DroppedFrames(3, 5), sim.DuplicateFrames(8, 10)))
+    assert sorted(faulty) == [0, 1, 2, 5, 6, 7, 8, 9, 10, 11]
+    for k, image in faulty.items():
+        assert np.array_equal(image, clean[7 if k in (8, 9) else k])
+    info = small_mission(sim.DroppedFrames(0, 12)).stream(sim.IMAGE)
+    assert (info.count, info.first_ns) == (0, -1)
+
+
+def test_exposure_jump() -> None:
+    clean, bright = small_mission(noise_grey=0), small_mission(sim.ExposureJump(4, 6, 1.2, 5), noise_grey=0)
+    for k in range(12):
+        expected = clean.frame(k) * (1.2 if k in (4, 5) else 1) + (5 if k in (4, 5) else 0)
+        np.testing.assert_allclose(bright.frame(k), np.clip(expected, 0, 255), atol=1.2)
+
+
+def test_motion_blur_weakens_the_texture_along_the_motion_and_keeps_the_place() -> None:
+    poses = ways.follow(ways.line(), np.full(4, 12 * W))
+    sharp, blurred = (
+        SimulatedMission(sinusoids(), poses, noise_grey=0, faults=faults)
+        for faults in ((), (sim.MotionBlur(2, 3, 0.5),))
+    )
+    assert np.array_equal(sharp.frame(1), blurred.frame(1))
+    v, u = np.mgrid[:512, :512] - 255.5
+    expected = np.full((512, 512), 120.0)
+    for amplitude, fx, fy, phase in WAVES:
+        wx, wy = 2 * np.pi * fx / PERIOD, 2 * np.pi * fy / PERIOD
+        attenuation = np.exp(-0.5 * PSF_SIGMA_PX**2 * (wx**2 + wy**2)) * np.sinc(wx * 6 / (2 * np.pi))
+        expected += amplitude * attenuation * np.cos(wx * (u + 24) + wy * v + phase)
+    np.testing.assert_allclose(blurred.frame(2), expected, atol=0.6)
+
+
+def test_a_repetitive_patch_lies_on_the_ground() -> None:
+    poses = ways.follow(ways.line(), np.full(99, 0.01))
+    patch = Patch(tiles(32, np.random.default_rng(0)), 0.4, 0.6, -1.0, 1.0)
+    fault = sim.RepetitivePatch.over(poses, patch)
+    assert (fault.start, fault.stop, fault.name) == (40, 60, "RepetitivePatch")
+    clean = SimulatedMission(sinusoids(), poses, noise_grey=0)
+    faulty = SimulatedMission(sinusoids(), poses, noise_grey=0, faults=[fault])
+    assert np.array_equal(clean.frame(10), faulty.frame(10))
+    inside = faulty.frame(50)[:, 200:312].astype(int)  # 0.2 m are 256 px, the frame sees 512
+    np.testing.assert_allclose(inside[32:], inside[:-32], atol=1)
+    far = np.r_[0:120, 392:512]
+    assert np.array_equal(clean.frame(50)[:, far], faulty.frame(50)[:, far])
+    with pytest.raises(ValueError, match="does not lead over"):
+        sim.RepetitivePatch.over(poses, Patch(patch.surface, 5, 6, 5, 6))
+
+
+def test_arrays_of_another_length_are_refused() -> None:
+    with pytest.raises(ValueError, match="give one number"):
+        small_mission(height_m=np.ones(3))
