@@ -114,20 +114,26 @@ def gravel(
     size_px: int,
     rng: np.random.Generator,
     *,
-    radius_px: tuple[float, float] = (3.0, 14.0),
+    radius_px: tuple[float, float] = (2.5, 16.0),
+    gradient_rms: float = 7.0,
     metres_per_px: float = PAPER_METRES_PER_PX,
 ) -> Surface:
     """Gravel: ellipsoidal pebbles of random size, shade and pose, one on another, lit from the side.
 
-    The texture is periodic with `size_px`. Radii follow a power law between the two `radius_px`.
+    The texture is periodic with `size_px`. Radii follow a power law between the two `radius_px`; the
+    contrast is set so that the gradient along an axis has `gradient_rms` grey levels per px, 7 being
+    that of the paper's gravel.
     """
     smallest, largest = radius_px
-    height = np.full((size_px, size_px), -1.0)
+    height = np.full((size_px, size_px), -np.inf)
     grey = 38 + 9 * _smooth_noise(size_px, 2.0, rng)
     for radius in _pebble_radii(size_px, smallest, largest, rng):
         _lay_pebble(grey, height, radius, rng)
-    grain = 5 * _smooth_noise(size_px, 0.7, rng) + 7 * _smooth_noise(size_px, 40.0, rng)
-    return surface_from_periodic(np.clip(grey + grain, 0, 255), metres_per_px=metres_per_px)
+    grey += 4 * _smooth_noise(size_px, 0.7, rng) + 10 * _smooth_noise(size_px, 40.0, rng)
+    grey = scipy.ndimage.gaussian_filter(grey, 0.7, mode="wrap")
+    gradient = (np.roll(grey, -1, axis=1) - np.roll(grey, 1, axis=1)) / 2
+    scaled = 110 + (grey - grey.mean()) * gradient_rms / np.sqrt(np.mean(gradient**2))
+    return surface_from_periodic(np.clip(scaled, 0, 255), metres_per_px=metres_per_px)
 
 
 def _pebble_radii(size_px: int, smallest: float, largest: float, rng: np.random.Generator) -> Floats:
