@@ -15,9 +15,13 @@ from typing import Any, ClassVar, Protocol, TypeVar
 from pydantic import BaseModel
 
 from pipelines.verdict import Verdict
-from readers.streams import Sample, StreamKind
+from readers.streams import Sample, StreamKind, WorkbenchError
 
 StateT = TypeVar("StateT")
+
+
+class EstimatorError(WorkbenchError):
+    """An estimator cannot work with these settings on this input; the text says which and what to change."""
 
 
 def quantity(unit: str, meaning: str, *shape: int | str) -> Any:

@@ -89,7 +89,8 @@ class ImageSample(Sample):
     name of a compressed format (``jpeg``, ``png``, ``tiff``, …). `width_px` and `height_px` are 0
     for compressed images whose header was not read. `step_bytes` and `big_endian` matter for raw
     encodings only. `payload` is the stored bytes, or a function that loads them; `source` names
-    where they come from (a file name, or topic and index) for messages.
+    where they come from (a file name, or topic and index) for messages. `frame` is the number of the
+    image in its stream, which the replay sets; -1 before.
     """
 
     encoding: str
@@ -99,6 +100,7 @@ class ImageSample(Sample):
     step_bytes: int = 0
     big_endian: bool = False
     source: str = ""
+    frame: int = -1
 
     @property
     def data(self) -> bytes | memoryview:
@@ -255,6 +257,7 @@ class Problem(Sample):
 
     kind: StreamKind
     reason: str
+    frame: int = -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -6,7 +6,7 @@ to the right of the vehicle seen from above (Oy). World and body: z up, x forwar
 counter-clockwise seen from above (REP 103); paper A counts them clockwise. All shifts are those of the
 image content from the template frame to this frame: the camera moves the other way.
 
-Shapes: F fragments, M = 2 · search radius + 1 positions a side. Numbers that were not computed are NaN,
+Shapes: F fragments, T tiles, M = 2 · search radius + 1 positions a side. Numbers that were not computed are NaN,
 and the verdict says why. Equation numbers are paper A's.
 """
 
@@ -64,13 +64,16 @@ class CorrelationStep(Step):
     shift_px: Floats = quantity("px", "shift of each fragment, integer plus subpixel (10), (11)", "F", 2)
 
     # 3. rigid motion of the frame (12), (13), (15)
-    weight: Floats = quantity("1", "weight of each fragment in the rigid fit, 0 for an outlier", "F")
+    weight: Floats = quantity("1", "robust weight of each fragment in the rigid fit, 0 for an outlier", "F")
     fit_residual_px: Floats = quantity("px", "shift of each fragment minus the rigid fit", "F", 2)
     inliers: int = quantity("1", "fragments that agree with the rigid fit")
-    rigidity_px: float = quantity("px", "distance between the matches minus that between the fragments")
+    rigidity_px: float = quantity("px", "distance between matches minus that between fragments, worst pair")
     scale: float = quantity("1", "size of the template in this frame: 1 while the height is constant")
     centre_shift_px: Floats = quantity("px", "shift (m_x0, n_y0) of the image centre from the template frame", 2)
     template_rotation_rad: float = quantity("rad", "rotation from the template frame to this frame")
+    tile_px: Floats = quantity("px", "centres (u, v) of the photometric tiles in the template frame", "T", 2)
+    tile_shift_px: Floats = quantity("px", "shift (u, v) of each photometric tile", "T", 2)
+    tile_weight: Floats = quantity("1", "weight of each tile in the final fit, 0 for an outlier", "T")
     motion_covariance: Floats = quantity("px², px·rad, rad²", "covariance of centre shift and rotation", 3, 3)
     rotation_limit_rad: float = quantity("rad", "largest rotation for this fragment size (1)")
 

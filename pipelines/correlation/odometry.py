@@ -1,0 +1,533 @@
+"""Two-fragment correlation odometry: paper A's chain and its robust successor, one frame at a time.
+
+`CorrelationOdometry` reads as the chain of the paper's Fig. 4: match the fragments (blocks 1, 2), fit the
+motion of the frame (3, 4), integrate the trajectory (5-8), correct it (9, 10), judge. Matching stands in
+`matching.py`, equations in `equations.py`, checks in `judging.py`, inner loops in `kernels.py`. Axes and signs
+are those of `step.py`.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.correlation import equations as eq
+from pipelines.correlation import kernels
+from pipelines.correlation.equations import STILL, Motion
+from pipelines.correlation.judging import MEDIAN_FROM, alarms_over_time, median
+from pipelines.correlation.layout import layout_of
+from pipelines.correlation.matching import NO_COVARIANCE, Candidate, Matcher, Template
+from pipelines.correlation.settings import Correction, CorrelationSettings
+from pipelines.correlation.step import CorrelationStep
+from pipelines.estimator import EstimatorError
+from pipelines.geometry import wrap_angle
+from pipelines.verdict import Verdict, gravest
+from readers.streams import ImageError, ImageSample, PoseSample, Problem, RangeSample, Sample, ScalarSample, StreamKind
+
+Floats = NDArray[np.float64]
+Grey = NDArray[np.uint8]
+Pose = tuple[float, float, float]
+
+
+class Segment(NamedTuple):
+    """A correction segment: frames and sums so far, deviations at its end, what is applied and what is due."""
+
+    frames: int = 0
+    sum_m: float = 0.0
+    reference_m: float = 0.0
+    relative_deviation: float = math.nan
+    deviation_m: float = math.nan
+    applied_m: tuple[float, float] = (0.0, 0.0)
+    due_m: tuple[float, float] = (0.0, 0.0)
+    start: tuple[float, float] = (0.0, 0.0)
+
+
+class Advance(NamedTuple):
+    """The motion since the frame before, and what follows from it for the trajectory."""
+
+    frame: int
+    dt_s: float
+    metres_per_px: float
+    motion: Motion
+    covariance_px: Floats
+    path_m: float
+    increment_m: tuple[float, float]
+
+
+@dataclass(frozen=True, slots=True)
+class CorrelationState:
+    """All that the odometry carries from frame to frame.
+
+    `template` is the frame that is searched next and `relative` the motion from it to the last frame;
+    `previous` is the last frame. `velocity` is the last measured motion between frames, which took
+    `velocity_s`. The tuples at the end are the values behind the running medians.
+    """
+
+    frames: int = 0
+    template: Template | None = None
+    previous: Template | None = None
+    previous_ns: int = -1
+    relative: Motion = STILL
+    velocity: Motion | None = None
+    velocity_s: float = math.nan
+    last_shift: Floats | None = None
+    inliers: int = 0
+    lost_frames: int = 0
+    pose: Pose = (0.0, 0.0, 0.0)
+    covariance: Floats | None = None
+    segment: Segment = Segment()
+    correction_total: tuple[float, float] = (0.0, 0.0)
+    height_m: float = math.nan
+    residuals: tuple[float, ...] = ()
+    gradients: tuple[float, ...] = ()
+    intervals_s: tuple[float, ...] = ()
+
+
+class CorrelationOdometry:
+    """Estimates the planar motion of a downward camera from image fragments.
+
+    Samples: images of one stream and, where the settings name a height stream, its ranges, numbers or poses.
+
+    Args:
+        settings: every setting; see `CorrelationSettings`.
+
+    Raises:
+        EstimatorError: neither `metres_per_px` nor a height together with `focal_px` is set.
+    """
+
+    name: ClassVar[str] = "correlation"
+    step_type: ClassVar[type[CorrelationStep]] = CorrelationStep
+    kinds: ClassVar[tuple[StreamKind, ...]] = (StreamKind.IMAGE, StreamKind.RANGE, StreamKind.SCALAR, StreamKind.POSE)
+
+    def __init__(self, settings: CorrelationSettings) -> None:
+        height_known = settings.height_m is not None or bool(settings.height_stream)
+        if settings.metres_per_px is None and not (settings.focal_px is not None and height_known):
+            raise EstimatorError(
+                "the scale is unknown: set metres_per_px, or focal_px together with height_m or height_stream"
+            )
+        self._settings = settings
+        self._matcher = Matcher(settings)
+        self._limit_rad = eq.rotation_limit(settings.fragment_side_px)
+
+    @property
+    def settings(self) -> CorrelationSettings:
+        """The frozen settings of this estimator."""
+        return self._settings
+
+    def start(self) -> CorrelationState:
+        """The state before the first sample."""
+        s = self._settings
+        return CorrelationState(
+            pose=s.start_pose,
+            covariance=np.zeros((3, 3)),
+            height_m=math.nan if s.height_m is None else s.height_m,
+        )
+
+    def step(self, state: CorrelationState, sample: Sample, /) -> tuple[CorrelationState, CorrelationStep | None]:
+        """Take one sample; an image, or the `Problem` of one, yields a Step.
+
+        Raises:
+            EstimatorError: the image is too small for the fragments, or no height came before it.
+        """
+        if isinstance(sample, ImageSample):
+            try:
+                return self._image(state, sample, eight_bit(sample.grey()))
+            except ImageError:
+                return self._skip(state, sample, Verdict.UNDECODABLE, None)
+        if isinstance(sample, Problem):
+            if sample.kind is not StreamKind.IMAGE:
+                return state, None
+            return self._skip(state, sample, Verdict.UNDECODABLE, None)
+        if sample.stream == self._settings.height_stream:
+            return replace(state, height_m=_height_of(sample) + self._settings.height_offset_m), None
+        return state, None
+
+    # ------------------------------------------------------------------------------ one frame
+
+    def _image(
+        self, state: CorrelationState, sample: ImageSample, grey: Grey
+    ) -> tuple[CorrelationState, CorrelationStep]:
+        previous = state.previous
+        if previous is None:
+            return self._restart(state, sample, grey, Verdict.FIRST_FRAME)
+        if sample.t_ns <= state.previous_ns:
+            return self._skip(state, sample, Verdict.OUT_OF_ORDER, grey)
+        if grey.shape != previous.grey.shape:
+            return self._restart(state, sample, grey, Verdict.SIZE_CHANGED)
+        if _same_image(grey, previous.grey):
+            return self._skip(state, sample, Verdict.DUPLICATE_FRAME, grey)
+
+        s = self._settings
+        frame = _frame_of(state, sample)
+        dt_s = (sample.t_ns - state.previous_ns) * 1e-9
+        metres_per_px = self._metres_per_px(state.height_m, frame)
+
+        candidate, alarms = self._find(state, previous, grey, dt_s)
+        alarms |= candidate.alarms
+        motion, relative, covariance_px = self._motion_between_frames(state, candidate, dt_s)
+        pose, increment, path_m = self._integrate(state.pose, motion, metres_per_px)
+        # a measured motion starts from its template frame, a held one from the frame before
+        base = candidate.template if candidate.acceptable else previous
+        camera_heading = pose[2] + s.mounting_yaw_rad
+        covariance = _propagated(base, pose, covariance_px, metres_per_px, camera_heading)
+        segment = self._correct(state, path_m, dt_s, pose)
+        total = (
+            state.correction_total[0] + segment.applied_m[0],
+            state.correction_total[1] + segment.applied_m[1],
+        )
+        if segment.applied_m != (0.0, 0.0):
+            alarms |= Verdict.CORRECTION_APPLIED
+
+        residual = median(candidate.matches.residual_rms.tolist())
+        gradient = median(candidate.matches.gradient.tolist())
+        alarms |= alarms_over_time(s, residual, state.residuals, gradient, state.gradients, dt_s, state.intervals_s)
+        accepted = candidate.acceptable
+        if not accepted:
+            alarms |= Verdict.LOST
+        keep = s.median_frames
+        new_state = CorrelationState(
+            frames=state.frames + 1,
+            template=candidate.template if accepted else state.template,
+            previous=Template(frame, grey, pose, covariance),
+            previous_ns=sample.t_ns,
+            relative=relative,
+            velocity=motion if accepted else state.velocity,
+            velocity_s=dt_s if accepted else state.velocity_s,
+            last_shift=_whole(candidate.shift),
+            inliers=candidate.inliers if accepted else state.inliers,
+            lost_frames=0 if accepted else state.lost_frames + 1,
+            pose=pose,
+            covariance=covariance,
+            segment=segment,
+            correction_total=total,
+            height_m=state.height_m,
+            residuals=(*state.residuals, residual)[-keep:] if accepted else state.residuals,
+            gradients=(*state.gradients, gradient)[-keep:] if accepted else state.gradients,
+            intervals_s=(*state.intervals_s, dt_s)[-keep:],
+        )
+        advance = Advance(frame, dt_s, metres_per_px, motion, covariance_px, path_m, increment)
+        return new_state, self._record(new_state, sample, grey, candidate, advance, alarms)
+
+    def _find(self, state: CorrelationState, previous: Template, grey: Grey, dt_s: float) -> tuple[Candidate, Verdict]:
+        """The best candidate for the motion to this frame: by prediction, where that fails by a global search."""
+        s = self._settings
+        step = self._held(state, dt_s) if s.prediction == "constant-velocity" else STILL
+        template, predicted = state.template, state.relative.then(step)
+        if template is None or not self._serves(state, template, predicted):
+            template, predicted = previous, step
+        usual = median(state.residuals) if len(state.residuals) >= MEDIAN_FROM else math.nan
+        first = self._matcher.match(template, grey, predicted, last_shift=state.last_shift, usual_residual=usual)
+        if not s.recovery:
+            return first, Verdict.OK
+        starting = state.velocity is None
+        if first.acceptable and not (starting and first.alarms & Verdict.PEAK_AT_BORDER):
+            return first, Verdict.OK
+        bases = [(template, None)] if template.frame == previous.frame else [(template, None), (previous, step)]
+        for base, prediction in bases:
+            if prediction is not None:
+                candidate = self._matcher.match(base, grey, prediction, usual_residual=usual)
+                if candidate.acceptable:
+                    return candidate, Verdict.OK
+            for motion in self._matcher.search_globally(base.grey, grey):
+                candidate = self._matcher.match(base, grey, motion, usual_residual=usual)
+                if candidate.acceptable:
+                    return candidate, Verdict.OK if starting else Verdict.REACQUIRED
+        return first, Verdict.OK
+
+    def _serves(self, state: CorrelationState, template: Template, predicted: Motion) -> bool:
+        """Whether the template frame may still be searched, or the frame before must take its place."""
+        s = self._settings
+        if state.previous is not None and template.frame == state.previous.frame:
+            return True
+        return (
+            s.key_frames
+            and state.lost_frames <= s.bridge_frames
+            and (state.lost_frames > 0 or state.inliers >= s.key_min_inliers)
+            and math.hypot(predicted.u, predicted.v) <= s.key_max_shift_px
+            and abs(predicted.rotation_rad) <= s.key_max_rotation_rad
+            and self._matcher.reaches(template, predicted)
+        )
+
+    def _held(self, state: CorrelationState, dt_s: float) -> Motion:
+        """The motion since the last frame at the last measured velocity; still where there is none."""
+        return STILL if state.velocity is None else state.velocity.times(dt_s / state.velocity_s)
+
+    def _motion_between_frames(
+        self, state: CorrelationState, candidate: Candidate, dt_s: float
+    ) -> tuple[Motion, Motion, Floats]:
+        """Motion since the frame before, motion since the (new) template, covariance in px and rad."""
+        if not candidate.acceptable:
+            held = self._held(state, dt_s) if self._settings.recovery else STILL
+            # nothing was measured: the held motion may be wrong by its whole size
+            sigma = max(math.hypot(held.u, held.v), 1.0), max(abs(held.rotation_rad), 0.01)
+            return held, state.relative.then(held), np.diag([sigma[0] ** 2, sigma[0] ** 2, sigma[1] ** 2])
+        measured = candidate.motion
+        assert state.previous is not None
+        if candidate.template.frame == state.previous.frame:
+            return measured, measured, candidate.covariance
+        return state.relative.inverse().then(measured), measured, candidate.covariance
+
+    # ------------------------------------------------------------- trajectory and correction
+
+    def _metres_per_px(self, height_m: float, frame: int) -> float:
+        """W: as given, or height over focal length."""
+        s = self._settings
+        if s.metres_per_px is not None:
+            return s.metres_per_px
+        assert s.focal_px is not None
+        if math.isnan(height_m):
+            raise EstimatorError(
+                f"no camera height came before frame {frame}: set height_m, or check that the stream "
+                f"{s.height_stream!r} holds values from the start on"
+            )
+        return height_m / s.focal_px
+
+    def _integrate(self, pose: Pose, motion: Motion, metres_per_px: float) -> tuple[Pose, tuple[float, float], float]:
+        """The new pose, the increment (m) and the length of the step (m): (14), (16), (17), or exactly on SE(2)."""
+        s = self._settings
+        x, y, heading = pose
+        turned = heading + motion.rotation_rad
+        path_m = eq.path_step((motion.u, motion.v), metres_per_px)
+        if s.integration == "exact" or s.mount == "gimballed":
+            increment = eq.increment_of_vector((motion.u, motion.v), metres_per_px, turned + s.mounting_yaw_rad)
+        elif s.integration == "mid-heading":
+            increment = eq.increment_along(path_m, heading + motion.rotation_rad / 2.0)
+        else:
+            increment = eq.increment_along(path_m, turned)
+        return (x + increment[0], y + increment[1], wrap_angle(turned)), increment, path_m
+
+    def _correct(self, state: CorrelationState, path_m: float, dt_s: float, pose: Pose) -> Segment:
+        """(18)-(21): sums over the segment; at its end the correction that the next frame applies."""
+        s, old = self._settings, state.segment
+        if s.correction is Correction.OFF:
+            return old
+        assert s.correction_speed_mps is not None
+        fresh = old.frames in (0, s.correction_frames)
+        frames = 1 if fresh else old.frames + 1
+        sum_m = path_m if fresh else old.sum_m + path_m
+        nominal_m = s.correction_speed_mps * dt_s
+        reference_m = nominal_m if fresh else old.reference_m + nominal_m
+        start = state.pose[:2] if fresh else old.start
+        if frames < s.correction_frames:
+            return Segment(frames, sum_m, reference_m, applied_m=old.due_m, start=start)
+        relative, deviation = eq.deviation_of_segment(sum_m, reference_m)
+        length = 0.0
+        if eq.correction_fires(relative, deviation, s.correction_max_relative, s.correction_min_m):
+            if s.correction is Correction.SPEED_PRIOR:
+                length = eq.correction_speed_prior(deviation, s.correction_gain)
+            else:
+                length = eq.correction_as_printed(relative, deviation, s.correction_par_m)
+        # along Ox, the heading; a gimballed camera has none, so A0 corrects both coordinates: along the segment
+        heading = pose[2] if s.mount == "rigid" else math.atan2(pose[1] - start[1], pose[0] - start[0])
+        due = eq.increment_along(length, heading)
+        return Segment(frames, sum_m, reference_m, relative, deviation, old.due_m, due, start)
+
+    # ---------------------------------------------------------------- frames without a motion
+
+    def _restart(
+        self, state: CorrelationState, sample: ImageSample, grey: Grey, verdict: Verdict
+    ) -> tuple[CorrelationState, CorrelationStep]:
+        """Begin, or begin again after the image size changed: there is nothing to compare this frame with."""
+        layout_of(self._settings, grey.shape[1], grey.shape[0])
+        assert state.covariance is not None
+        frame = _frame_of(state, sample)
+        this = Template(frame, grey, state.pose, state.covariance)
+        new = replace(
+            state,
+            frames=state.frames + 1,
+            template=this,
+            previous=this,
+            previous_ns=sample.t_ns,
+            relative=STILL,
+            velocity=None,
+            velocity_s=math.nan,
+            last_shift=None,
+        )
+        return new, self._blank(new, sample, grey, verdict)
+
+    def _skip(
+        self, state: CorrelationState, sample: ImageSample | Problem, verdict: Verdict, grey: Grey | None
+    ) -> tuple[CorrelationState, CorrelationStep]:
+        """Pass over a frame that cannot be compared; the next one is compared with the frame before it."""
+        new = replace(state, frames=state.frames + 1)
+        return new, self._blank(new, sample, grey, verdict)
+
+    # -------------------------------------------------------------------------------- records
+
+    def _blank(
+        self, state: CorrelationState, sample: ImageSample | Problem, grey: Grey | None, verdict: Verdict
+    ) -> CorrelationStep:
+        """The Step of a frame without a match: the pose as it was, all measurements NaN."""
+        s = self._settings
+        if grey is None:
+            grey = np.empty((0, 0), np.uint8) if state.previous is None else state.previous.grey
+        count, tiles = s.columns * s.rows, s.tile_columns * s.tile_rows
+        matches = kernels.no_matches(count, s.search_radius_px)
+        nothing = np.full((count, 2), np.nan)
+        candidate = Candidate(
+            template=Template(-1, grey, state.pose, NO_COVARIANCE),
+            motion=Motion(math.nan, math.nan, math.nan, math.nan),
+            predicted_shift=nothing,
+            search=nothing,
+            matches=matches,
+            texture=kernels.texture_of(matches, s.fragment_side_px),
+            shift=nothing,
+            weight=np.zeros(count),
+            residual=nothing,
+            inliers=0,
+            tile_shift=np.full((tiles, 2), np.nan),
+            tile_weight=np.zeros(tiles),
+            covariance=NO_COVARIANCE,
+            alarms=verdict,
+            acceptable=False,
+        )
+        beginning = verdict in (Verdict.FIRST_FRAME, Verdict.SIZE_CHANGED) or state.previous is None
+        dt_s = math.nan if beginning else (sample.t_ns - state.previous_ns) * 1e-9
+        metres_per_px = s.metres_per_px if s.metres_per_px is not None else state.height_m / (s.focal_px or math.nan)
+        frame = state.frames - 1 if sample.frame < 0 else sample.frame
+        advance = Advance(frame, dt_s, metres_per_px, STILL, NO_COVARIANCE, 0.0, (0.0, 0.0))
+        unchanged = replace(state, segment=state.segment._replace(applied_m=(0.0, 0.0)))
+        return self._record(unchanged, sample, grey, candidate, advance, verdict)
+
+    def _record(
+        self,
+        state: CorrelationState,
+        sample: ImageSample | Problem,
+        grey: Grey,
+        candidate: Candidate,
+        advance: Advance,
+        alarms: Verdict,
+    ) -> CorrelationStep:
+        """Everything that was computed for this frame; `state` is the one after it."""
+        s = self._settings
+        m, texture, motion = candidate.matches, candidate.texture, candidate.motion
+        height, width = grey.shape
+        if grey.size:
+            layout = layout_of(s, width, height)
+            fragments, points, tiles = layout.centres, layout.points, layout.tile_centres
+        else:
+            fragments = points = np.full(candidate.shift.shape, np.nan)
+            tiles = np.full(candidate.tile_shift.shape, np.nan)
+        x, y, heading = state.pose
+        total_x, total_y = state.correction_total
+        covariance = state.covariance
+        assert covariance is not None
+        return CorrelationStep(
+            frame=advance.frame,
+            t_ns=sample.t_ns,
+            received_ns=sample.received_ns,
+            verdict=gravest(alarms),
+            alarms=alarms,
+            accepted=candidate.acceptable,
+            template_frame=candidate.template.frame,
+            dt_s=advance.dt_s,
+            image_size_px=np.array([width, height], np.float64),
+            mean_grey=median(m.mean_grey.tolist()),
+            gradient_energy=median(m.gradient.tolist()),
+            fragment_side_px=s.fragment_side_px,
+            search_radius_px=s.search_radius_px,
+            fragment_px=_floats(fragments),
+            predicted_shift_px=candidate.predicted_shift,
+            search_centre_px=_floats(candidate.search),
+            surface=m.surface,
+            peak_px=m.peak_px,
+            peak_correlation=m.peak_correlation,
+            second_peak_px=m.second_peak_px,
+            second_peak_correlation=m.second_peak_correlation,
+            peak_ratio=texture.peak_ratio,
+            peak_curvature=m.peak_curvature,
+            peak_anisotropy=m.peak_anisotropy,
+            delta_px=m.delta_px,
+            hessian=m.hessian,
+            condition=texture.condition,
+            smallest_eigenvalue=texture.smallest_eigenvalue,
+            iterations=m.iterations,
+            gain=m.gain,
+            offset=m.offset,
+            residual_rms=m.residual_rms,
+            sigma_px=texture.sigma_px,
+            shift_px=candidate.shift,
+            weight=candidate.weight,
+            fit_residual_px=candidate.residual,
+            inliers=candidate.inliers,
+            rigidity_px=kernels.worst_rigidity(points, candidate.shift),
+            scale=motion.scale,
+            centre_shift_px=np.array([motion.u, motion.v]),
+            template_rotation_rad=motion.rotation_rad,
+            tile_px=_floats(tiles),
+            tile_shift_px=candidate.tile_shift,
+            tile_weight=candidate.tile_weight,
+            motion_covariance=advance.covariance_px,
+            rotation_limit_rad=self._limit_rad,
+            frame_shift_px=np.array([advance.motion.u, advance.motion.v]),
+            delta_heading_rad=advance.motion.rotation_rad,
+            heading_rad=heading,
+            metres_per_px=advance.metres_per_px,
+            height_m=state.height_m,
+            path_step_m=advance.path_m,
+            increment_m=np.array(advance.increment_m),
+            segment_frames=state.segment.frames,
+            segment_sum_m=state.segment.sum_m,
+            segment_reference_m=state.segment.reference_m,
+            relative_deviation=state.segment.relative_deviation,
+            deviation_m=state.segment.deviation_m,
+            correction_m=np.array(state.segment.applied_m),
+            correction_total_m=np.array(state.correction_total),
+            pose_raw=np.array(state.pose),
+            pose=np.array([x + total_x, y + total_y, heading]),
+            pose_covariance=covariance,
+        )
+
+
+def eight_bit(grey: NDArray[np.uint8] | NDArray[np.uint16]) -> Grey:
+    """Grey levels as uint8; of 16-bit images the upper eight bits."""
+    if grey.dtype == np.uint8:
+        return grey  # type: ignore[return-value]
+    return (grey >> 8).astype(np.uint8)
+
+
+def _frame_of(state: CorrelationState, sample: ImageSample) -> int:
+    return state.frames if sample.frame < 0 else sample.frame
+
+
+def _height_of(sample: Sample) -> float:
+    """Camera height in metres: a range, a number, or the z of a pose."""
+    if isinstance(sample, RangeSample):
+        return sample.range_m
+    if isinstance(sample, ScalarSample):
+        return sample.value
+    if isinstance(sample, PoseSample):
+        return float(sample.position_m[2])
+    raise EstimatorError(f"stream {sample.stream!r} holds no heights: name a stream of ranges, numbers or poses")
+
+
+def _same_image(a: Grey, b: Grey) -> bool:
+    """Whether two images of one shape are equal pixel by pixel; one row tells most of them apart."""
+    row = a.shape[0] // 2
+    return np.array_equal(a[row], b[row]) and np.array_equal(a, b)
+
+
+def _whole(shift: Floats) -> Floats:
+    """Shifts rounded to whole pixels, zero where there is none: the centres of the next search."""
+    return np.floor(np.nan_to_num(shift) + 0.5)
+
+
+def _floats(pixels: NDArray[np.int64] | Floats) -> Floats:
+    return pixels.astype(np.float64)
+
+
+def _propagated(base: Template, pose: Pose, covariance_px: Floats, metres_per_px: float, heading_rad: float) -> Floats:
+    """Covariance [3, 3] of the pose from that at `base` and that of the motion from there, in px and rad.
+
+    P' = F P Fᵀ + G Q Gᵀ, linearised about the motion: F carries the heading's error over the distance driven,
+    G turns the shift in px (u, v) and the rotation into the world.
+    """
+    east, north = pose[0] - base.pose[0], pose[1] - base.pose[1]
+    c, s = metres_per_px * math.cos(heading_rad), metres_per_px * math.sin(heading_rad)
+    F = np.array([[1.0, 0.0, -north], [0.0, 1.0, east], [0.0, 0.0, 1.0]])
+    G = np.array([[-c, -s, -north], [-s, c, east], [0.0, 0.0, 1.0]])
+    return F @ base.covariance @ F.T + G @ covariance_px @ G.T
