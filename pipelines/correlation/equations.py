@@ -8,7 +8,11 @@ headings are counter-clockwise from above. `docs/odometry.md` lists the misprint
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple
+
+from numba import njit
+
+_jit: Any = njit(cache=True, error_model="numpy")
 
 
 class Motion(NamedTuple):
@@ -60,11 +64,13 @@ def rotation_limit(side_px: int, pixel_px: float = 1.0) -> float:
     return math.atan(pixel_px / (2.0 * math.sqrt(2.0) * ((side_px - 1) / 2)))
 
 
+@_jit
 def centre_shift(front: tuple[float, float], rear: tuple[float, float]) -> tuple[float, float]:
     """Shift (m_x0, n_y0) of the image centre from those of two fragments, px. Paper A (12), (13)."""
     return (front[0] + rear[0]) / 2.0, (front[1] + rear[1]) / 2.0
 
 
+@_jit
 def rotation_between_frames(front_v: float, rear_v: float, distance_px: float) -> float:
     """Δα (rad, counter-clockwise), the camera's rotation, from the fragments' shifts across the travel.
 

@@ -3,95 +3,148 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from typing import Any, NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
+from numba import njit
 
-from pipelines.correlation.kernels import Fit, Matches, Texture
+from pipelines.correlation.equations import rotation_limit
+from pipelines.correlation.kernels import QUANTISATION, matches_of
 from pipelines.correlation.settings import CorrelationSettings
 from pipelines.verdict import Verdict
 
-MEDIAN_FROM = 5
-"""A running median counts from this many frames on."""
+_jit: Any = njit(cache=True, nogil=True, error_model="numpy")
+_matches_of = _jit(matches_of)
+
+# compiled code knows flags as plain integers
+_PEAK_AMBIGUOUS = int(Verdict.PEAK_AMBIGUOUS)
+_PEAK_AT_BORDER = int(Verdict.PEAK_AT_BORDER)
+_LOW_CORRELATION = int(Verdict.LOW_CORRELATION)
+_LOW_TEXTURE = int(Verdict.LOW_TEXTURE)
+_APERTURE = int(Verdict.APERTURE)
+_SUBPIXEL_DIVERGED = int(Verdict.SUBPIXEL_DIVERGED)
+_ROTATION_BEYOND_LIMIT = int(Verdict.ROTATION_BEYOND_LIMIT)
+_HEIGHT_CHANGE = int(Verdict.HEIGHT_CHANGE)
+_NOT_RIGID = int(Verdict.NOT_RIGID)
 
 
-def median(values: Sequence[float]) -> float:
-    """Median of the finite values (the higher one of the middle pair), NaN if there is none."""
-    finite = sorted(v for v in values if v == v)
-    return finite[len(finite) // 2] if finite else math.nan
+class Limits(NamedTuple):
+    """The thresholds of `CorrelationSettings` in a form that compiled code takes."""
+
+    every_fragment: bool
+    max_peak_ratio: float
+    min_correlation: float
+    search_radius_px: float
+    min_eigenvalue: float
+    min_texture_ratio: float
+    max_condition: float
+    step_limit_px: float
+    rotation_limit_rad: float
+    max_scale_change: float
+    max_rigidity_px: float
 
 
-def alarms_of_match(
-    s: CorrelationSettings,
-    m: Matches,
-    texture: Texture,
-    peak_offset_px: NDArray[np.int64],
-) -> Verdict:
-    """The checks on the correlation surfaces and on the texture of all fragments.
+def limits_of(s: CorrelationSettings) -> Limits:
+    """The thresholds of the settings."""
+    return Limits(
+        s.motion == "paper",
+        s.max_peak_ratio,
+        s.min_correlation,
+        float(s.search_radius_px),
+        s.min_eigenvalue,
+        s.min_texture_ratio,
+        s.max_condition,
+        s.step_limit_px,
+        rotation_limit(s.fragment_side_px),
+        s.max_scale_change,
+        s.max_rigidity_px,
+    )
 
-    `peak_offset_px` [F, 2] is the peak's position in its surface, from the centre. With the paper's two
-    fragments each one counts; with more, the median one, since outliers are left out of the fit.
+
+@_jit
+def median(values):  # type: ignore[no-untyped-def]
+    """Median of the finite values [n] (the higher one of the middle pair), NaN if there is none."""
+    kept = np.sort(values[np.isfinite(values)])
+    return kept[len(kept) // 2] if len(kept) else math.nan
+
+
+@_jit
+def _high(values, every):  # type: ignore[no-untyped-def]
+    """What counts of numbers that are bad when high: the worst of the paper's two, else the median one."""
+    return np.max(values) if every else median(values)
+
+
+@_jit
+def alarms_of_match(surface, hessian, block, centres, search, limits):  # type: ignore[no-untyped-def]
+    """The checks on the correlation surfaces and the texture of all fragments, as flags of `Verdict`.
+
+    With the paper's two fragments each one counts; with more, the median one, since outliers are left out.
     """
-    alarms = Verdict.OK
-    high, low = (max, min) if s.motion == "paper" else (median, median)
-    if high(texture.peak_ratio.tolist()) > s.max_peak_ratio:
-        alarms |= Verdict.PEAK_AMBIGUOUS
-    if not low(m.peak_correlation.tolist()) >= s.min_correlation:
-        alarms |= Verdict.LOW_CORRELATION
-    if high([max(abs(i), abs(j)) for i, j in peak_offset_px.tolist()]) >= s.search_radius_px:
-        alarms |= Verdict.PEAK_AT_BORDER
-    margins = []
-    for smallest, rms in zip(texture.smallest_eigenvalue.tolist(), m.residual_rms.tolist(), strict=True):
+    m = _matches_of(surface, hessian, block)
+    every, count = limits.every_fragment, len(centres)
+    alarms = 0
+    if _high(m.peak_ratio, every) > limits.max_peak_ratio:
+        alarms |= _PEAK_AMBIGUOUS
+    if not -_high(-m.peak_correlation, every) >= limits.min_correlation:
+        alarms |= _LOW_CORRELATION
+    away, missing, diverged = np.empty(count), np.empty(count), 0
+    for i in range(count):
+        away[i] = max(
+            abs(centres[i, 0] + m.peak_px[i, 0] - search[i, 0]), abs(centres[i, 1] + m.peak_px[i, 1] - search[i, 1])
+        )
         # noise of σ grey levels alone gives central differences a power of σ²/2, and a residual of √2 σ
-        noise = rms * rms / 4.0 if rms == rms else 0.0
-        margins.append(smallest - max(s.min_eigenvalue, s.min_texture_ratio * noise))
-    if not low(margins) >= 0.0:
-        alarms |= Verdict.LOW_TEXTURE
-    if high(texture.condition.tolist()) > s.max_condition:
-        alarms |= Verdict.APERTURE
-    lengths = texture.delta_length_px.tolist()
-    diverged = sum(not length <= s.step_limit_px for length in lengths)
-    if diverged > (0 if s.motion == "paper" else len(lengths) // 2):
-        alarms |= Verdict.SUBPIXEL_DIVERGED
+        noise = m.residual_rms[i] ** 2 / 4.0
+        missing[i] = max(limits.min_eigenvalue, limits.min_texture_ratio * noise) - m.smallest_eigenvalue[i]
+        diverged += not m.delta_length_px[i] <= limits.step_limit_px
+    if _high(away, every) >= limits.search_radius_px:
+        alarms |= _PEAK_AT_BORDER
+    if not _high(missing, every) <= 0.0:
+        alarms |= _LOW_TEXTURE
+    if _high(m.condition, every) > limits.max_condition:
+        alarms |= _APERTURE
+    if diverged > (0 if every else count // 2):
+        alarms |= _SUBPIXEL_DIVERGED
     return alarms
 
 
-def alarms_of_fit(s: CorrelationSettings, m: Matches, fit: Fit, uncompensated_rad: float, limit_rad: float) -> Verdict:
-    """The checks on brightness, rotation and height of a frame whose fragments agree on a motion."""
-    alarms = Verdict.OK
-    ratios, changes = [], []
-    rows = zip(fit.weight.tolist(), m.gain.tolist(), m.offset.tolist(), m.mean_grey.tolist(), strict=True)
-    for weight, gain, offset, level in rows:
-        if weight > 0.0 and gain > 0.0:
-            ratios.append(gain)
-            changes.append(abs(level - (level - offset) / gain))
-    ratio, change = median(ratios), median(changes)
-    if ratio < s.gain_limits[0] or ratio > s.gain_limits[1] or change > s.max_level_change:
-        alarms |= Verdict.EXPOSURE_JUMP
-    if abs(uncompensated_rad) > limit_rad:
-        alarms |= Verdict.ROTATION_BEYOND_LIMIT
-    if abs(fit.scale - 1.0) > s.max_scale_change:
-        alarms |= Verdict.HEIGHT_CHANGE
+@_jit
+def alarms_of_fit(limits, uncompensated_rad, scale, distance_px):  # type: ignore[no-untyped-def]
+    """The checks on rigidity, height and rotation of a frame whose motion was fitted.
+
+    `distance_px` is that of the paper's two fragments, whose disagreement shows as a change of scale.
+    """
+    alarms = 0
+    if limits.every_fragment and abs(scale - 1.0) * distance_px > limits.max_rigidity_px:
+        return _NOT_RIGID
+    if abs(scale - 1.0) > limits.max_scale_change:
+        alarms |= _HEIGHT_CHANGE
+    if abs(uncompensated_rad) > limits.rotation_limit_rad:
+        alarms |= _ROTATION_BEYOND_LIMIT
     return alarms
+
+
+class Usual(NamedTuple):
+    """Running medians before a frame: residual (grey), gradient energy (grey²/px²), interval (s); NaN at first."""
+
+    residual: float = math.nan
+    gradient: float = math.nan
+    interval_s: float = math.nan
 
 
 def alarms_over_time(
-    s: CorrelationSettings,
-    residual: float,
-    residuals: Sequence[float],
-    gradient: float,
-    gradients: Sequence[float],
-    dt_s: float,
-    intervals_s: Sequence[float],
-) -> Verdict:
-    """The checks of a frame against the running medians of the frames before it."""
-    alarms = Verdict.OK
-    if len(residuals) >= MEDIAN_FROM:
-        if residual > s.max_residual_ratio * max(median(residuals), 0.3):
-            alarms |= Verdict.RESIDUAL_HIGH
-        if gradient < s.min_gradient_ratio * median(gradients):
-            alarms |= Verdict.BLURRED
-    if len(intervals_s) >= 3 and dt_s > s.gap_factor * median(intervals_s):
+    s: CorrelationSettings, residual: float, gradient: float, dt_s: float, level_change: float, usual: Usual
+) -> int:
+    """The checks of a frame against the running medians of the frames before it, as flags of `Verdict`.
+
+    `level_change` is that of the mean grey level since the frame before.
+    """
+    alarms = 0
+    if abs(level_change) > s.max_level_change:
+        alarms |= Verdict.EXPOSURE_JUMP
+    if residual > s.max_residual_ratio * max(usual.residual, QUANTISATION):
+        alarms |= Verdict.RESIDUAL_HIGH
+    if gradient < s.min_gradient_ratio * usual.gradient:
+        alarms |= Verdict.BLURRED
+    if dt_s > s.gap_factor * usual.interval_s:
         alarms |= Verdict.FRAME_GAP
-    return alarms
+    return int(alarms)

@@ -13,6 +13,8 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pipelines.correlation.equations import centre_shift, rotation_between_frames
+
 Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Grey = NDArray[np.uint8]
@@ -23,6 +25,10 @@ POLE = 3.0**0.5 - 2.0
 """Pole of the cubic B-spline's prefilter."""
 PREFILTER_MARGIN = 8
 """Pixels around a patch after which the prefilter has forgotten the border (POLE^8 = 3e-5)."""
+MEDIAN_FROM = 5
+"""A running median counts from this many values on."""
+QUANTISATION = 0.3
+"""Least noise of a match in grey levels: rounding to whole levels, 1/sqrt(12)."""
 HILL_PX = 2
 """Positions this close to the first peak belong to its hill and are no second peak."""
 
@@ -30,23 +36,40 @@ _CARDINAL = (-6.0 * POLE / (1.0 - POLE * POLE)) * POLE ** np.abs(np.arange(-TAPS
 
 
 class Matches(NamedTuple):
-    """What the matching of F fragments yields; the fields of `CorrelationStep` by the same names."""
+    """What the matching of F fragments yields; the fields of `CorrelationStep` by the same names.
+
+    All but `surface` [F, M, M] and `hessian` [F, 2, 2] are views of one block [F, VALUES], because handing an
+    array between Python and compiled code costs a microsecond.
+    """
 
     surface: Floats32
+    hessian: Floats
     peak_px: Floats
     peak_correlation: Floats
     second_peak_px: Floats
     second_peak_correlation: Floats
+    peak_ratio: Floats
     peak_curvature: Floats
     peak_anisotropy: Floats
     delta_px: Floats
-    hessian: Floats
+    delta_length_px: Floats
+    condition: Floats
+    smallest_eigenvalue: Floats
+    sigma_px: Floats
     iterations: Floats
     gain: Floats
     offset: Floats
     residual_rms: Floats
     gradient: Floats
     mean_grey: Floats
+    shift_px: Floats
+    weight: Floats
+    fit_residual_px: Floats
+    block: Floats
+
+
+VALUES = 27
+"""Columns of the block behind `Matches`."""
 
 
 class Fit(NamedTuple):
@@ -67,6 +90,46 @@ class Fit(NamedTuple):
 
 
 _jit: Any = njit(cache=True, nogil=True, error_model="numpy")
+
+
+def matches_of(surface, hessian, block):  # type: ignore[no-untyped-def]
+    """The named views of a block; the same for Python and for compiled code."""
+    return Matches(
+        surface,
+        hessian,
+        block[:, 0:2],
+        block[:, 2],
+        block[:, 3:5],
+        block[:, 5],
+        block[:, 6],
+        block[:, 7],
+        block[:, 8],
+        block[:, 9:11],
+        block[:, 11],
+        block[:, 12],
+        block[:, 13],
+        block[:, 14:16],
+        block[:, 16],
+        block[:, 17],
+        block[:, 18],
+        block[:, 19],
+        block[:, 20],
+        block[:, 21],
+        block[:, 22:24],
+        block[:, 24],
+        block[:, 25:27],
+        block,
+    )
+
+
+_matches_of = _jit(matches_of)
+
+
+def no_matches(count: int, radius: int) -> Matches:
+    """Matches of `count` fragments in which nothing was found yet: all NaN."""
+    surface = np.full((count, 2 * radius + 1, 2 * radius + 1), np.nan, np.float32)
+    matches: Matches = matches_of(surface, np.full((count, 2, 2), np.nan), np.full((count, VALUES), np.nan))
+    return matches
 
 
 # ------------------------------------------------------------------------- patches and splines
@@ -124,16 +187,18 @@ def spline_half(side):  # type: ignore[no-untyped-def]
 
 @_jit
 def spline_patches(image, centres, side):  # type: ignore[no-untyped-def]
-    """Cubic B-spline coefficients around each centre, float32 [F, S, S], S = 2 · spline_half + 1.
+    """Cubic B-spline coefficients around each centre, float32 [S, S, lanes], S = 2 · spline_half + 1.
 
-    `centres` int64 [F, 2] (u, v). The spline through the pixels is then known at every real position.
+    `centres` int64 [F, 2] (u, v). The spline through the pixels is then known at every real position. The
+    fragments are the last axis, padded to whole vectors: all are sampled at the same places, one per lane.
     """
     half = spline_half(side)
     size = 2 * half + 1
-    patches = np.empty((centres.shape[0], size, size), np.float32)
+    count = centres.shape[0]
+    patches = np.zeros((size, size, (count + 7) // 8 * 8), np.float32)
     turned = np.empty((size, size), np.float32)
-    for i in range(centres.shape[0]):
-        patch = patches[i]
+    patch = np.empty((size, size), np.float32)
+    for i in range(count):
         _copy_window(image, centres[i, 1] - half, centres[i, 0] - half, turned)
         _spline_columns(turned)
         for y in range(size):
@@ -141,56 +206,73 @@ def spline_patches(image, centres, side):  # type: ignore[no-untyped-def]
                 patch[x, y] = turned[y, x]
         _spline_columns(patch)
         for y in range(size):
-            for x in range(y):
-                patch[y, x], patch[x, y] = patch[x, y], patch[y, x]
+            for x in range(size):
+                patches[y, x, i] = patch[x, y]
     return patches
 
 
 @_jit
-def _template(coefficients, side, rotation_rad, grey, slope_u, slope_v):  # type: ignore[no-untyped-def]
-    """Sample a fragment, turned by `rotation_rad`, and its gradient in the turned axes, each [N, N].
+def _basis(f):  # type: ignore[no-untyped-def]
+    """Cubic B-spline weights of the four taps around a position, and their derivatives."""
+    g = np.float32(1.0) - f
+    sixth, half = np.float32(1.0 / 6.0), np.float32(0.5)
+    three, four, six = np.float32(3.0), np.float32(4.0), np.float32(6.0)
+    w0, w1, w3 = g * g * g * sixth, (three * f * f * f - six * f * f + four) * sixth, f * f * f * sixth
+    d0, d1, d3 = -half * g * g, (three * f * f - four * f) * half, half * f * f
+    return w0, w1, np.float32(1.0) - w0 - w1 - w3, w3, d0, d1, -d0 - d1 - d3, d3
 
-    T(q) = I(p + R(-ψ) q): the content of the template frame as it looks after a rotation by ψ.
+
+@_jit
+def templates(coefficients, count, side, rotation_rad):  # type: ignore[no-untyped-def]
+    """Sample every fragment, turned by `rotation_rad`, with its gradient in the turned axes.
+
+    T(q) = I(p + R(-ψ) q): the content of the template frame as it looks after a rotation by ψ. Returns float32
+    [3, F, N, N]: grey levels, slope along u, slope along v.
     """
     half = (side - 1) // 2
     middle = np.float32((coefficients.shape[0] - 1) // 2)
+    lanes = coefficients.shape[2]
     cos, sin = np.float32(np.cos(rotation_rad)), np.float32(np.sin(rotation_rad))
-    sixth, one, three = np.float32(1.0 / 6.0), np.float32(1.0), np.float32(3.0)
-    four, six = np.float32(4.0), np.float32(6.0)
-    half_f = np.float32(0.5)
+    sampled = np.empty((3, count, side, side), np.float32)
+    row = np.empty((3, side, lanes), np.float32)
     for y in range(side):
         qv = np.float32(y - half)
         for x in range(side):
             qu = np.float32(x - half)
-            u = middle + cos * qu + sin * qv
-            v = middle - sin * qu + cos * qv
+            u, v = middle + cos * qu + sin * qv, middle - sin * qu + cos * qv
             iu, iv = int(u), int(v)
-            a, b = u - np.float32(iu), v - np.float32(iv)
-            a1, b1 = one - a, one - b
-            wu0, wu1 = a1 * a1 * a1 * sixth, (three * a * a * a - six * a * a + four) * sixth
-            wu3 = a * a * a * sixth
-            wu2 = one - wu0 - wu1 - wu3
-            wv0, wv1 = b1 * b1 * b1 * sixth, (three * b * b * b - six * b * b + four) * sixth
-            wv3 = b * b * b * sixth
-            wv2 = one - wv0 - wv1 - wv3
-            du0, du1, du3 = -half_f * a1 * a1, (three * a * a - four * a) * half_f, half_f * a * a
-            du2 = -du0 - du1 - du3
-            dv0, dv1, dv3 = -half_f * b1 * b1, (three * b * b - four * b) * half_f, half_f * b * b
-            dv2 = -dv0 - dv1 - dv3
-            value, gu, gv = np.float32(0.0), np.float32(0.0), np.float32(0.0)
+            u0, u1, u2, u3, e0, e1, e2, e3 = _basis(u - np.float32(iu))
+            v0, v1, v2, v3, f0, f1, f2, f3 = _basis(v - np.float32(iv))
+            grey, slope_u, slope_v = row[0, x], row[1, x], row[2, x]
             for k in range(4):
-                row = coefficients[iv + k - 1]
-                c0, c1, c2, c3 = row[iu - 1], row[iu], row[iu + 1], row[iu + 2]
-                along = wu0 * c0 + wu1 * c1 + wu2 * c2 + wu3 * c3
-                slope = du0 * c0 + du1 * c1 + du2 * c2 + du3 * c3
-                wv = wv0 if k == 0 else (wv1 if k == 1 else (wv2 if k == 2 else wv3))
-                dv = dv0 if k == 0 else (dv1 if k == 1 else (dv2 if k == 2 else dv3))
-                value += wv * along
-                gu += wv * slope
-                gv += dv * along
-            grey[y, x] = value
-            slope_u[y, x] = cos * gu - sin * gv
-            slope_v[y, x] = sin * gu + cos * gv
+                wv = v0 if k == 0 else (v1 if k == 1 else (v2 if k == 2 else v3))
+                dv = f0 if k == 0 else (f1 if k == 1 else (f2 if k == 2 else f3))
+                c0, c1 = coefficients[iv + k - 1, iu - 1], coefficients[iv + k - 1, iu]
+                c2, c3 = coefficients[iv + k - 1, iu + 1], coefficients[iv + k - 1, iu + 2]
+                if k == 0:
+                    for lane in range(lanes):
+                        along = (u0 * c0[lane] + u1 * c1[lane]) + (u2 * c2[lane] + u3 * c3[lane])
+                        slope = (e0 * c0[lane] + e1 * c1[lane]) + (e2 * c2[lane] + e3 * c3[lane])
+                        grey[lane] = wv * along
+                        slope_u[lane] = wv * slope
+                        slope_v[lane] = dv * along
+                else:
+                    for lane in range(lanes):
+                        along = (u0 * c0[lane] + u1 * c1[lane]) + (u2 * c2[lane] + u3 * c3[lane])
+                        slope = (e0 * c0[lane] + e1 * c1[lane]) + (e2 * c2[lane] + e3 * c3[lane])
+                        grey[lane] += wv * along
+                        slope_u[lane] += wv * slope
+                        slope_v[lane] += dv * along
+            for lane in range(lanes):
+                gu, gv = slope_u[lane], slope_v[lane]
+                slope_u[lane] = cos * gu - sin * gv
+                slope_v[lane] = sin * gu + cos * gv
+        for part in range(3):
+            for i in range(count):
+                target = sampled[part, i, y]
+                for x in range(side):
+                    target[x] = row[part, x, i]
+    return sampled
 
 
 @_jit
@@ -444,9 +526,6 @@ def one_step(previous, image, u, v, peak_u, peak_v, side, hessian):  # type: ign
 class _Scratch(NamedTuple):
     """Work space of the iterated refinement, so that no iteration allocates."""
 
-    grey: Floats32
-    slope_u: Floats32
-    slope_v: Floats32
     window: Floats32
     rows: Floats32
     sampled: Floats32
@@ -458,9 +537,6 @@ class _Scratch(NamedTuple):
 def _scratch(side):  # type: ignore[no-untyped-def]
     width = side + TAPS - 1
     return _Scratch(
-        np.empty((side, side), np.float32),
-        np.empty((side, side), np.float32),
-        np.empty((side, side), np.float32),
         np.empty((width, width), np.float32),
         np.empty((side, width), np.float32),
         np.empty((side, side), np.float32),
@@ -524,20 +600,19 @@ def _centre(a):  # type: ignore[no-untyped-def]
 
 @_jit
 def refine(  # type: ignore[no-untyped-def]
-    coefficients, image, u, v, du, dv, rotation_rad, side, gain_and_offset, limit, tolerance, work, hessian
+    grey, slope_u, slope_v, image, u, v, du, dv, gain_and_offset, limit, tolerance, work, hessian
 ):
     """Iterated inverse-compositional refinement on a cubic spline.
 
-    Minimises Σ (I(p + d + q) - g T(q) - b)² over the shift d, and over gain g and offset b where asked; T is
-    the fragment turned by `rotation_rad`. The gradient is that of the template, so one Hessian serves all
+    Minimises Σ (I(p + d + q) - g T(q) - b)² over the shift d, and over gain g and offset b where asked; T and its
+    slopes [N, N] come from `templates` and are used up. The gradient is that of the template, so one Hessian serves all
     iterations; gain and offset are projected out, so that they cost nothing in an iteration. (du, dv) is the
     start, relative to the integer position (u, v) in the image.
 
     Returns (δu, δv, iterations, g, b, rms of the residual in grey, mean grey of the match); `hessian` [2, 2]
     receives I_xyᵀ I_xy of the template in grey²/px².
     """
-    grey, slope_u, slope_v = work.grey, work.slope_u, work.slope_v
-    _template(coefficients, side, rotation_rad, grey, slope_u, slope_v)
+    side = grey.shape[0]
     n = side * side
     hessian[0, 0], hessian[1, 1] = _lines(slope_u, slope_u), _lines(slope_v, slope_v)
     hessian[0, 1] = hessian[1, 0] = _lines(slope_u, slope_v)
@@ -590,29 +665,6 @@ def refine(  # type: ignore[no-untyped-def]
 
 
 @_jit
-def no_matches(count, radius):  # type: ignore[no-untyped-def]
-    """Matches of `count` fragments in which nothing was found: all NaN."""
-    nan = np.nan
-    return Matches(
-        np.full((count, 2 * radius + 1, 2 * radius + 1), np.float32(nan)),
-        np.full((count, 2), nan),
-        np.full(count, nan),
-        np.full((count, 2), nan),
-        np.full(count, nan),
-        np.full(count, nan),
-        np.full(count, nan),
-        np.full((count, 2), nan),
-        np.full((count, 2, 2), nan),
-        np.zeros(count),
-        np.full(count, nan),
-        np.full(count, nan),
-        np.full(count, nan),
-        np.full(count, nan),
-        np.full(count, nan),
-    )
-
-
-@_jit
 def _note_peaks(matches, i, centre, search, radius):  # type: ignore[no-untyped-def]
     """Find the peaks of fragment i's surface and note them; False where the surface holds no position."""
     surface = matches.surface[i]
@@ -626,6 +678,8 @@ def _note_peaks(matches, i, centre, search, radius):  # type: ignore[no-untyped-
         matches.second_peak_px[i, 0] = search[i, 0] + second_k - radius - centre[i, 0]
         matches.second_peak_px[i, 1] = search[i, 1] + second_j - radius - centre[i, 1]
         matches.second_peak_correlation[i] = second
+        if value > 0.0:
+            matches.peak_ratio[i] = second / value
     du, dv, curvature, anisotropy = peak_shape(surface, j, k)
     matches.peak_curvature[i], matches.peak_anisotropy[i] = curvature, anisotropy
     matches.delta_px[i, 0] = 0.0 if np.isnan(du) else du
@@ -634,17 +688,17 @@ def _note_peaks(matches, i, centre, search, radius):  # type: ignore[no-untyped-
 
 
 @_jit
-def match_one_step(previous, image, centres, search, side, radius):  # type: ignore[no-untyped-def]
+def match_one_step(previous, image, centres, search, side, radius, surface, hessian, block):  # type: ignore[no-untyped-def]
     """The paper's steps 1 and 2 for every fragment: correlation peak (2), (3), one flow step (4)-(9).
 
     `previous`, `image` uint8 [height, width]; `centres`, `search` int64 [F, 2] (u, v): fragment centres in
-    the previous frame and centres of the search areas in this one. Returns `Matches`.
+    the previous frame and centres of the search areas in this one. Fills the arrays of `no_matches`.
     """
-    count = centres.shape[0]
+    m = _matches_of(surface, hessian, block)
     half = (side - 1) // 2
-    m = no_matches(count, radius)
+    n = side * side
     template = np.empty((side, side), np.float32)
-    for i in range(count):
+    for i in range(centres.shape[0]):
         u, v = centres[i]
         _copy_window(previous, v - half, u - half, template)
         correlation_surface(template, image, search[i, 0], search[i, 1], radius, m.surface[i])
@@ -655,7 +709,6 @@ def match_one_step(previous, image, centres, search, side, radius):  # type: ign
             previous, image, u, v, pu, pv, side, m.hessian[i]
         )
         m.iterations[i] = 1
-        m.gradient[i] = (m.hessian[i, 0, 0] + m.hessian[i, 1, 1]) / (side * side)
         st, sw, stt, stw = np.int64(0), np.int64(0), np.int64(0), np.int64(0)
         for y in range(v - half, v + half + 1):
             for x in range(u - half, u + half + 1):
@@ -664,72 +717,73 @@ def match_one_step(previous, image, centres, search, side, radius):  # type: ign
                 sw += w
                 stt += t * t
                 stw += t * w
-        n = side * side
         spread = float(n * stt - st * st)
         m.mean_grey[i] = sw / n
         if spread > 0.0:
             m.gain[i] = float(n * stw - st * sw) / spread
             m.offset[i] = (sw - m.gain[i] * st) / n
-    return m
+        _note_texture(m, i, n)
 
 
 @_jit
 def match_iterated(  # type: ignore[no-untyped-def]
-    coefficients, image, centres, search, rotation_rad, side, radius, gain_and_offset, limit, tolerance
-):
-    """Correlation peak with the turned template, then the iterated refinement, for every fragment.
+    coefficients, image, centres, search, rotation_rad, side, radius, gain_and_offset, limit, tolerance,
+    surface, hessian, block,
+):  # fmt: skip
+    """Correlation peak with the turned templates, then the iterated refinement, for every fragment.
 
-    `coefficients` float32 [F, S, S] from `spline_patches`; the rest as in `match_one_step`. Returns `Matches`.
+    `coefficients` float32 [S, S, lanes] from `spline_patches`; the rest as in `match_one_step`.
     """
-    count = centres.shape[0]
-    m = no_matches(count, radius)
+    m = _matches_of(surface, hessian, block)
     work = _scratch(side)
-    for i in range(count):
-        _template(coefficients[i], side, rotation_rad, work.grey, work.slope_u, work.slope_v)
-        correlation_surface(work.grey, image, search[i, 0], search[i, 1], radius, m.surface[i])
+    t = templates(coefficients, centres.shape[0], side, rotation_rad)
+    for i in range(centres.shape[0]):
+        correlation_surface(t[0, i], image, search[i, 0], search[i, 1], radius, m.surface[i])
+        m.iterations[i] = 0
         if _note_peaks(m, i, centres, search, radius):
-            _refine_match(
-                m, i, coefficients[i], image, centres, rotation_rad, side, gain_and_offset, limit, tolerance, work
-            )
-    return m
+            _refine_match(m, i, t, image, centres, gain_and_offset, limit, tolerance, work)
 
 
 @_jit
 def refine_again(  # type: ignore[no-untyped-def]
-    m, coefficients, image, centres, rotation_rad, side, gain_and_offset, limit, tolerance
+    coefficients, image, centres, rotation_rad, side, gain_and_offset, limit, tolerance, surface, hessian, block
 ):
     """Refine matches once more, from where they are, with templates turned by a better rotation."""
+    m = _matches_of(surface, hessian, block)
     work = _scratch(side)
+    t = templates(coefficients, centres.shape[0], side, rotation_rad)
     for i in range(centres.shape[0]):
         if np.isfinite(m.delta_px[i, 0]):
-            _refine_match(
-                m, i, coefficients[i], image, centres, rotation_rad, side, gain_and_offset, limit, tolerance, work
-            )
+            _refine_match(m, i, t, image, centres, gain_and_offset, limit, tolerance, work)
 
 
 @_jit
-def _refine_match(  # type: ignore[no-untyped-def]
-    m, i, coefficients, image, centres, rotation_rad, side, gain_and_offset, limit, tolerance, work
-):
-    du, dv, iterations, gain, offset, rms, m.mean_grey[i] = refine(
-        coefficients,
-        image,
-        centres[i, 0] + m.peak_px[i, 0],
-        centres[i, 1] + m.peak_px[i, 1],
-        m.delta_px[i, 0],
-        m.delta_px[i, 1],
-        rotation_rad,
-        side,
-        gain_and_offset,
-        limit,
-        tolerance,
-        work,
-        m.hessian[i],
-    )
+def _refine_match(m, i, t, image, centres, gain_and_offset, limit, tolerance, work):  # type: ignore[no-untyped-def]
+    u, v = centres[i, 0] + m.peak_px[i, 0], centres[i, 1] + m.peak_px[i, 1]
+    du, dv, iterations, gain, offset, rms, level = refine(
+        t[0, i], t[1, i], t[2, i], image, u, v, m.delta_px[i, 0], m.delta_px[i, 1], gain_and_offset, limit,
+        tolerance, work, m.hessian[i],
+    )  # fmt: skip
     m.delta_px[i, 0], m.delta_px[i, 1] = du, dv
     m.iterations[i] += iterations
-    m.gain[i], m.offset[i], m.residual_rms[i] = gain, offset, rms
-    m.gradient[i] = (m.hessian[i, 0, 0] + m.hessian[i, 1, 1]) / (side * side)
+    m.gain[i], m.offset[i], m.residual_rms[i], m.mean_grey[i] = gain, offset, rms, level
+    _note_texture(m, i, t.shape[2] * t.shape[3])
+
+
+@_jit
+def _note_texture(m, i, pixels):  # type: ignore[no-untyped-def]
+    """Note what the Hessian of fragment i says: eigenvalues, σ = sqrt(rms² diag(H⁻¹)), and what follows."""
+    h00, h01, h11 = m.hessian[i, 0, 0], m.hessian[i, 0, 1], m.hessian[i, 1, 1]
+    mean, spread = (h00 + h11) / 2.0, np.sqrt((h00 - h11) ** 2 / 4.0 + h01 * h01)
+    m.gradient[i] = 2.0 * mean / pixels
+    m.smallest_eigenvalue[i] = (mean - spread) / pixels
+    m.condition[i] = (mean + spread) / (mean - spread) if mean - spread > 0.0 else np.inf
+    det = h00 * h11 - h01 * h01
+    if det > 0.0:
+        rms = max(m.residual_rms[i], QUANTISATION)
+        m.sigma_px[i, 0], m.sigma_px[i, 1] = rms * np.sqrt(h11 / det), rms * np.sqrt(h00 / det)
+    m.delta_length_px[i] = np.sqrt(m.delta_px[i, 0] ** 2 + m.delta_px[i, 1] ** 2)
+    m.shift_px[i, 0], m.shift_px[i, 1] = m.peak_px[i, 0] + m.delta_px[i, 0], m.peak_px[i, 1] + m.delta_px[i, 1]
 
 
 @_jit
@@ -749,6 +803,7 @@ def refine_tiles(  # type: ignore[no-untyped-def]
     rms = np.full(count, np.nan)
     cos, sin = scale * np.cos(rotation_rad), scale * np.sin(rotation_rad)
     work = _scratch(side)
+    t = templates(coefficients, count, side, rotation_rad)
     for i in range(count):
         pu, pv = points[i]
         u = cos * pu - sin * pv + shift_u + centres[i, 0] - pu
@@ -757,14 +812,14 @@ def refine_tiles(  # type: ignore[no-untyped-def]
             continue
         iu, iv = np.floor(u + 0.5), np.floor(v + 0.5)
         du, dv, _, _, _, residual, _ = refine(
-            coefficients[i],
+            t[0, i],
+            t[1, i],
+            t[2, i],
             image,
             iu,
             iv,
             u - iu,
             v - iv,
-            rotation_rad,
-            side,
             gain_and_offset,
             limit,
             tolerance,
@@ -777,6 +832,38 @@ def refine_tiles(  # type: ignore[no-untyped-def]
 
 
 # --------------------------------------------------------- 3. rigid motion (12), (13), (15)
+
+
+@_jit
+def paper_fit(surface, hessian, block, points, step_limit, gimballed, covariance):  # type: ignore[no-untyped-def]
+    """The paper's motion from two fragments, the rear one first: (10)-(13), (15).
+
+    A Δ longer than `step_limit` is rejected, not clipped: the integer shift stands. Notes shift, weight and
+    residual in the block; `covariance` [3, 3] of (m_x0, n_y0, Δα) receives that of the fragments' σ.
+
+    Returns (m_x0, n_y0, Δα, scale); NaN where a fragment has no peak.
+    """
+    m = _matches_of(surface, hessian, block)
+    for i in range(2):
+        if not m.delta_length_px[i] <= step_limit:
+            m.shift_px[i, 0], m.shift_px[i, 1] = m.peak_px[i, 0], m.peak_px[i, 1]
+    distance = points[1, 0] - points[0, 0]
+    rear, front = (m.shift_px[0, 0], m.shift_px[0, 1]), (m.shift_px[1, 0], m.shift_px[1, 1])
+    u, v = centre_shift(front, rear)
+    rotation = 0.0 if gimballed else rotation_between_frames(front[1], rear[1], distance)
+    scale = np.sqrt((distance + front[0] - rear[0]) ** 2 + (front[1] - rear[1]) ** 2) / distance
+    cos, sin = scale * np.cos(rotation), scale * np.sin(rotation)
+    for i in range(2):
+        m.weight[i] = 1.0 if np.isfinite(rotation + u) else 0.0
+        m.fit_residual_px[i, 0] = points[i, 0] + m.shift_px[i, 0] - (cos * points[i, 0] - sin * points[i, 1] + u)
+        m.fit_residual_px[i, 1] = points[i, 1] + m.shift_px[i, 1] - (sin * points[i, 0] + cos * points[i, 1] + v)
+    rear_u, rear_v = m.sigma_px[0, 0] ** 2, m.sigma_px[0, 1] ** 2
+    front_u, front_v = m.sigma_px[1, 0] ** 2, m.sigma_px[1, 1] ** 2
+    covariance[:] = 0.0
+    covariance[0, 0], covariance[1, 1] = (front_u + rear_u) / 4.0, (front_v + rear_v) / 4.0
+    covariance[2, 2] = (front_v + rear_v) / (distance * distance)
+    covariance[1, 2] = covariance[2, 1] = (front_v - rear_v) / (2.0 * distance)
+    return u, v, rotation, scale
 
 
 @_jit
@@ -877,7 +964,7 @@ def photometric_fit(  # type: ignore[no-untyped-def]
                 continue
             inliers += 1
             weight[i] = 1.0 / (1.0 + r2 / (robust_scale * robust_scale)) ** 2
-            w = weight[i] / max(noise[i], 0.3) ** 2
+            w = weight[i] / max(noise[i], QUANTISATION) ** 2
             h00, h01, h11 = w * hessians[i, 0, 0], w * hessians[i, 0, 1], w * hessians[i, 1, 1]
             ju = (1.0, 0.0, -tv, tu)
             jv = (0.0, 1.0, tu, tv)
@@ -896,45 +983,6 @@ def photometric_fit(  # type: ignore[no-untyped-def]
     return Fit(mu, mv, rotation_rad, scale, weight, residual, inliers, covariance[:3, :3].copy())
 
 
-# ------------------------------------------------------------------------------- what they say
-
-
-class Texture(NamedTuple):
-    """What the Hessians of F fragments say: eigenvalues, predicted accuracy, lengths of the subpixel steps."""
-
-    condition: Floats
-    smallest_eigenvalue: Floats
-    sigma_px: Floats
-    peak_ratio: Floats
-    delta_length_px: Floats
-
-
-@_jit
-def texture_of(m, side):  # type: ignore[no-untyped-def]
-    """Condition number and smaller eigenvalue (per pixel) of I_xyᵀ I_xy, σ = sqrt(rms² diag(H⁻¹)), and more."""
-    count = m.hessian.shape[0]
-    t = Texture(
-        np.full(count, np.nan),
-        np.full(count, np.nan),
-        np.full((count, 2), np.nan),
-        np.full(count, np.nan),
-        np.full(count, np.nan),
-    )
-    for i in range(count):
-        h00, h01, h11 = m.hessian[i, 0, 0], m.hessian[i, 0, 1], m.hessian[i, 1, 1]
-        mean, spread = (h00 + h11) / 2.0, np.sqrt((h00 - h11) ** 2 / 4.0 + h01 * h01)
-        t.smallest_eigenvalue[i] = (mean - spread) / (side * side)
-        t.condition[i] = (mean + spread) / (mean - spread) if mean - spread > 0.0 else np.inf
-        det = h00 * h11 - h01 * h01
-        if det > 0.0:
-            rms = max(m.residual_rms[i], 0.3)
-            t.sigma_px[i, 0], t.sigma_px[i, 1] = rms * np.sqrt(h11 / det), rms * np.sqrt(h00 / det)
-        if m.peak_correlation[i] > 0.0:
-            t.peak_ratio[i] = m.second_peak_correlation[i] / m.peak_correlation[i]
-        t.delta_length_px[i] = np.sqrt(m.delta_px[i, 0] ** 2 + m.delta_px[i, 1] ** 2)
-    return t
-
-
 @_jit
 def worst_rigidity(points, shifts):  # type: ignore[no-untyped-def]
     """Distance of two matches minus that of their fragments, px, of the pair where it is largest in size."""
@@ -947,3 +995,66 @@ def worst_rigidity(points, shifts):  # type: ignore[no-untyped-def]
             if abs(change) > abs(worst):
                 worst = change
     return worst
+
+
+@_jit
+def propagated(covariance, base, pose, motion_covariance, metres_per_px, heading_rad):  # type: ignore[no-untyped-def]
+    """Covariance [3, 3] of `pose` from that at the pose `base` and that of the motion in px and rad.
+
+    P' = F P Fᵀ + G Q Gᵀ, linearised about the motion: F carries the heading's error over the distance driven,
+    G turns the shift in px (u, v) and the rotation into the world.
+    """
+    along_x, along_y = pose[0] - base[0], pose[1] - base[1]
+    c, s = metres_per_px * np.cos(heading_rad), metres_per_px * np.sin(heading_rad)
+    F = ((1.0, 0.0, -along_y), (0.0, 1.0, along_x), (0.0, 0.0, 1.0))
+    G = ((-c, -s, -along_y), (-s, c, along_x), (0.0, 0.0, 1.0))
+    result = np.zeros((3, 3))
+    for i in range(3):
+        for j in range(3):
+            total = 0.0
+            for k in range(3):
+                for n in range(3):
+                    total += F[i][k] * covariance[k, n] * F[j][n] + G[i][k] * motion_covariance[k, n] * G[j][n]
+            result[i, j] = total
+    return result
+
+
+@_jit
+def running_medians(history):  # type: ignore[no-untyped-def]
+    """Median of the finite values of each row [n, K], NaN below `MEDIAN_FROM` of them: (median of row 0, 1, 2)."""
+    medians = (np.nan, np.nan, np.nan)
+    for row in range(3):
+        kept = np.empty(history.shape[1])
+        count = 0
+        for value in history[row]:
+            if np.isfinite(value):
+                kept[count] = value
+                count += 1
+        if count >= MEDIAN_FROM:
+            middle = np.sort(kept[:count])[count // 2]
+            if row == 0:
+                medians = (middle, medians[1], medians[2])
+            elif row == 1:
+                medians = (medians[0], middle, medians[2])
+            else:
+                medians = (medians[0], medians[1], middle)
+    return medians
+
+
+@_jit
+def frame_statistics(image):  # type: ignore[no-untyped-def]
+    """Mean grey level, and mean squared gradient (grey²/px²), over every 16th row of an image."""
+    height, width = image.shape
+    total, energy, count = np.int64(0), np.int64(0), 0
+    for y in range(8, height - 1, 16):
+        row, below = image[y], image[y + 1]
+        line, square = np.int32(0), np.int32(0)
+        for x in range(width - 1):
+            here = np.int32(row[x])
+            du, dv = np.int32(row[x + 1]) - here, np.int32(below[x]) - here
+            line += here
+            square += du * du + dv * dv
+        total += line
+        energy += square
+        count += width - 1
+    return total / max(count, 1), energy / max(count, 1)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import functools
 from typing import NamedTuple
 
 import numpy as np
@@ -32,7 +31,6 @@ class Layout(NamedTuple):
     tile_points: Floats
 
 
-@functools.lru_cache(maxsize=16)
 def layout_of(settings: CorrelationSettings, width: int, height: int) -> Layout:
     """The layout for an image of that size, in px.
 

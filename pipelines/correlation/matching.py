@@ -10,10 +10,9 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.correlation import equations as eq
 from pipelines.correlation import kernels
 from pipelines.correlation.equations import Motion
-from pipelines.correlation.judging import alarms_of_fit, alarms_of_match, median
+from pipelines.correlation.judging import alarms_of_fit, alarms_of_match, limits_of, median
 from pipelines.correlation.layout import Layout, layout_of, shifts_of
 from pipelines.correlation.settings import CorrelationSettings
 from pipelines.verdict import Verdict
@@ -29,7 +28,6 @@ GLOBAL_PATCH = 0.35
 MAX_SCALE_CHANGE = 0.1
 """Two fragments whose matches change their distance by more than this share propose no motion."""
 
-_NO_PATCHES = np.empty((0, 0, 0), np.float32)
 NO_COVARIANCE = np.full((3, 3), np.nan)
 
 
@@ -38,22 +36,22 @@ class Template:
     """A frame whose fragments are searched in others.
 
     `grey` uint8 [height, width], `pose` (x m, y m, heading rad) and its `covariance` [3, 3] at that frame;
-    `fragments`, `tiles` float32 [n, S, S] are spline patches, empty until they are needed.
+    `fragments`, `tiles` float32 [n, S, S] are spline patches, None until they are needed.
     """
 
     frame: int
     grey: Grey
     pose: tuple[float, float, float]
     covariance: Floats
-    fragments: NDArray[np.float32] = _NO_PATCHES
-    tiles: NDArray[np.float32] = _NO_PATCHES
+    fragments: NDArray[np.float32] | None = None
+    tiles: NDArray[np.float32] | None = None
 
 
 class Candidate(NamedTuple):
     """One attempt to find the motion from a template frame to this frame.
 
     `motion` is what was found (the prediction where nothing was), `predicted_shift` [F, 2] and `search` [F, 2]
-    where it was looked for, `shift` [F, 2] integer plus subpixel, `covariance` [3, 3] of shift (px) and rotation.
+    where it was looked for, `covariance` [3, 3] of shift (px) and rotation.
     """
 
     template: Template
@@ -61,15 +59,11 @@ class Candidate(NamedTuple):
     predicted_shift: Floats
     search: Integers
     matches: kernels.Matches
-    texture: kernels.Texture
-    shift: Floats
-    weight: Floats
-    residual: Floats
     inliers: int
     tile_shift: Floats
     tile_weight: Floats
     covariance: Floats
-    alarms: Verdict
+    alarms: int
     acceptable: bool
 
 
@@ -78,14 +72,26 @@ class Matcher:
 
     def __init__(self, settings: CorrelationSettings) -> None:
         self._s = settings
-        self._limit_rad = eq.rotation_limit(settings.fragment_side_px)
+        self._limits = limits_of(settings)
+        self._layouts: dict[tuple[int, int], Layout] = {}
+
+    def layout(self, width: int, height: int) -> Layout:
+        """The layout for an image of that size.
+
+        Raises:
+            EstimatorError: the fragments do not fit into the image.
+        """
+        size = (width, height)
+        if size not in self._layouts:
+            self._layouts[size] = layout_of(self._s, width, height)
+        return self._layouts[size]
 
     def prepare(self, template: Template) -> Template:
         """The template with its spline patches, where the refinement needs them."""
         s = self._s
-        if s.refiner == "one-step" or len(template.fragments):
+        if s.refiner == "one-step" or template.fragments is not None:
             return template
-        layout = layout_of(s, template.grey.shape[1], template.grey.shape[0])
+        layout = self.layout(template.grey.shape[1], template.grey.shape[0])
         fragments = kernels.spline_patches(template.grey, layout.centres, s.fragment_side_px)
         tiles = kernels.spline_patches(template.grey, layout.tile_centres, s.tile_side_px)
         return Template(template.frame, template.grey, template.pose, template.covariance, fragments, tiles)
@@ -94,7 +100,7 @@ class Matcher:
         """Whether every fragment of the template, after that motion, still lies inside the image."""
         height, width = template.grey.shape
         margin = (self._s.fragment_side_px - 1) / 2
-        layout = layout_of(self._s, width, height)
+        layout = self.layout(width, height)
         low_u, low_v = margin - (width - 1) / 2, margin - (height - 1) / 2
         for u, v in layout.points.tolist():
             du, dv = motion.shift_of(u, v)
@@ -122,8 +128,8 @@ class Matcher:
         """
         s = self._s
         height, width = grey.shape
-        layout = layout_of(s, width, height)
-        alarms = Verdict.OK
+        layout = self.layout(width, height)
+        alarms = 0
         if s.prediction == "constant-velocity":
             expected = shifts_of(predicted, layout.points)
         elif s.prediction == "last-shift" and last_shift is not None:
@@ -136,18 +142,20 @@ class Matcher:
             alarms |= Verdict.SEARCH_OUTSIDE_IMAGE
             if s.prediction == "last-shift":
                 search[outside] = layout.centres[outside]
+        m = kernels.no_matches(len(layout.centres), s.search_radius_px)
+        block = (m.surface, m.hessian, m.block)
         if s.refiner == "one-step":
-            m = kernels.match_one_step(
-                template.grey, grey, layout.centres, search, s.fragment_side_px, s.search_radius_px
-            )
             turned = 0.0
+            kernels.match_one_step(
+                template.grey, grey, layout.centres, search, s.fragment_side_px, s.search_radius_px, *block
+            )
         else:
             template = self.prepare(template)
             turn = s.rotate_template and abs(predicted.rotation_rad) > s.rotate_above_rad
             turned = predicted.rotation_rad if turn else 0.0
-            m = kernels.match_iterated(
+            kernels.match_iterated(
                 template.fragments, grey, layout.centres, search, turned, s.fragment_side_px,
-                s.search_radius_px, s.gain_and_offset, s.max_iterations, s.tolerance_px,
+                s.search_radius_px, s.gain_and_offset, s.max_iterations, s.tolerance_px, *block,
             )  # fmt: skip
         if s.motion == "paper":
             return self._paper_motion(template, expected, search, m, layout, alarms)
@@ -162,39 +170,18 @@ class Matcher:
         search: Integers,
         m: kernels.Matches,
         layout: Layout,
-        alarms: Verdict,
+        alarms: int,
     ) -> Candidate:
         """Motion from two fragments as the paper has it: (10)-(13), (15)."""
         s = self._s
-        texture = kernels.texture_of(m, s.fragment_side_px)
-        shifts = []
-        for (peak_u, peak_v), (du, dv) in zip(m.peak_px.tolist(), m.delta_px.tolist(), strict=True):
-            # a Δ beyond its limit is rejected, not clipped: the integer shift stands
-            valid = math.hypot(du, dv) <= s.step_limit_px
-            shifts.append((peak_u + du, peak_v + dv) if valid else (peak_u, peak_v))
-        rear, front = shifts
-        (rear_u, _), (front_u, _) = layout.points.tolist()
-        distance = front_u - rear_u
-        centre = eq.centre_shift(front, rear)
-        rotation = 0.0 if s.mount == "gimballed" else eq.rotation_between_frames(front[1], rear[1], distance)
-        matched = math.hypot(distance + front[0] - rear[0], front[1] - rear[1])
-        found = math.isfinite(centre[0]) and math.isfinite(rotation)
-        motion = Motion(*centre, rotation) if found else Motion(0.0, 0.0, 0.0)
-        shift = np.array(shifts)
-        residual = shift - shifts_of(motion, layout.points)
-        covariance = _two_fragment_covariance(texture.sigma_px.tolist(), distance)
-        fit = kernels.Fit(
-            *centre, rotation, matched / distance, np.full(2, float(found)), residual, 2 * found, covariance
-        )
-        alarms |= alarms_of_match(s, m, texture, (layout.centres + m.peak_px - search).astype(np.int64))
-        if abs(matched - distance) > s.max_rigidity_px:
-            alarms |= Verdict.NOT_RIGID
-        if not alarms & (Verdict.NOT_RIGID | Verdict.LOW_CORRELATION):
-            alarms |= alarms_of_fit(s, m, fit, rotation, self._limit_rad)
-        return Candidate(
-            template, motion._replace(scale=fit.scale), expected, search, m, texture, shift, fit.weight, residual,
-            fit.inliers, *no_tiles(layout), covariance, alarms, found,
-        )  # fmt: skip
+        arrays = (m.surface, m.hessian, m.block)
+        covariance = np.empty((3, 3))
+        motion = Motion(*kernels.paper_fit(*arrays, layout.points, s.step_limit_px, s.mount == "gimballed", covariance))
+        found = math.isfinite(motion.u) and math.isfinite(motion.rotation_rad)
+        alarms |= alarms_of_match(*arrays, layout.centres, search, self._limits)
+        distance = layout.points[1, 0] - layout.points[0, 0]
+        alarms |= alarms_of_fit(self._limits, motion.rotation_rad, motion.scale, distance)
+        return Candidate(template, motion, expected, search, m, 2 * found, *no_tiles(layout), covariance, alarms, found)
 
     def _robust_motion(
         self,
@@ -206,38 +193,35 @@ class Matcher:
         search: Integers,
         m: kernels.Matches,
         layout: Layout,
-        alarms: Verdict,
+        alarms: int,
         usual_residual: float,
     ) -> Candidate:
         """Motion that most fragments agree on, then the photometric step over tiles of the whole frame."""
         s = self._s
-        texture = kernels.texture_of(m, s.fragment_side_px)
-        found = self._agree(m, texture, layout)
+        found = self._agree(m, layout)
         if found[4] >= 2 and s.rotate_template and abs(found[2] - turned) > s.rotate_above_rad:
             turned = found[2]
             kernels.refine_again(
-                m, template.fragments, grey, layout.centres, turned, s.fragment_side_px, s.gain_and_offset,
-                s.max_iterations, s.tolerance_px,
+                template.fragments, grey, layout.centres, turned, s.fragment_side_px, s.gain_and_offset,
+                s.max_iterations, s.tolerance_px, m.surface, m.hessian, m.block,
             )  # fmt: skip
-            texture = kernels.texture_of(m, s.fragment_side_px)
-            found = self._agree(m, texture, layout)
-        shift = m.peak_px + m.delta_px
-        peak_offset = np.nan_to_num(layout.centres + m.peak_px - search).astype(np.int64)
-        alarms |= alarms_of_match(s, m, texture, peak_offset)
+            found = self._agree(m, layout)
+        alarms |= alarms_of_match(m.surface, m.hessian, m.block, layout.centres, search, self._limits)
+        m.weight[:] = 0.0
         candidate = Candidate(
-            template, predicted, expected, search, m, texture, shift, np.zeros(len(shift)),
-            np.full(shift.shape, np.nan), 0, *no_tiles(layout), NO_COVARIANCE,
-            alarms | Verdict.TOO_FEW_INLIERS, False,
+            template, predicted, expected, search, m, 0, *no_tiles(layout), NO_COVARIANCE,
+            alarms | int(Verdict.TOO_FEW_INLIERS), False,
         )  # fmt: skip
         if found[4] < 2:
             return candidate
-        usable = np.where(texture.delta_length_px <= s.step_limit_px, m.residual_rms, np.nan)
+        usable = np.where(m.delta_length_px <= s.step_limit_px, m.residual_rms, np.nan)
         fit = kernels.photometric_fit(
-            layout.points, shift, m.hessian, usable, *found[:4], s.inlier_px, s.robust_scale_px
+            layout.points, m.shift_px, m.hessian, usable, *found[:4], s.inlier_px, s.robust_scale_px
         )
-        alarms |= alarms_of_fit(s, m, fit, fit.rotation_rad - turned, self._limit_rad)
+        m.weight[:], m.fit_residual_px[:] = fit.weight, fit.residual
+        alarms |= alarms_of_fit(self._limits, fit.rotation_rad - turned, fit.scale, math.nan)
         used = fit.weight > 0.0
-        gain, residual = median(m.gain[used].tolist()), median(m.residual_rms[used].tolist())
+        gain, residual = median(m.gain[used]), median(m.residual_rms[used])
         few = fit.inliers < s.min_inliers
         acceptable = (
             not few
@@ -250,22 +234,18 @@ class Matcher:
         rotation = 0.0 if s.mount == "gimballed" else final.rotation_rad
         return candidate._replace(
             motion=Motion(final.shift_u, final.shift_v, rotation, final.scale),
-            weight=fit.weight,
-            residual=fit.residual,
             inliers=fit.inliers,
             tile_shift=tile_shift,
             tile_weight=tile_weight,
             covariance=final.covariance,
-            alarms=alarms | (Verdict.TOO_FEW_INLIERS if few else Verdict.OK),
+            alarms=alarms | (int(Verdict.TOO_FEW_INLIERS) if few else 0),
             acceptable=acceptable,
         )
 
-    def _agree(
-        self, m: kernels.Matches, texture: kernels.Texture, layout: Layout
-    ) -> tuple[float, float, float, float, int]:
-        usable = texture.delta_length_px <= self._s.step_limit_px
+    def _agree(self, m: kernels.Matches, layout: Layout) -> tuple[float, float, float, float, int]:
+        usable = m.delta_length_px <= self._s.step_limit_px
         found: tuple[float, float, float, float, int] = kernels.consensus(
-            layout.points, m.peak_px + m.delta_px, usable, self._s.inlier_px, MAX_SCALE_CHANGE
+            layout.points, m.shift_px, usable, self._s.inlier_px, MAX_SCALE_CHANGE
         )
         return found
 
@@ -328,16 +308,3 @@ def _outside(search: list[list[int]], side: int, radius: int, width: int, height
         for i, (u, v) in enumerate(search)
         if u + reach < 0 or v + reach < 0 or u - reach > width - 1 or v - reach > height - 1
     ]
-
-
-def _two_fragment_covariance(sigma_px: list[list[float]], distance_px: float) -> Floats:
-    """Covariance [3, 3] of (m_x0, n_y0, Δα) from the σ of two fragments: (12), (13), (15) linearised."""
-    (rear_u, rear_v), (front_u, front_v) = sigma_px
-    across = (front_v**2 - rear_v**2) / (2.0 * distance_px)
-    return np.array(
-        [
-            [(front_u**2 + rear_u**2) / 4.0, 0.0, 0.0],
-            [0.0, (front_v**2 + rear_v**2) / 4.0, across],
-            [0.0, across, (front_v**2 + rear_v**2) / distance_px**2],
-        ]
-    )

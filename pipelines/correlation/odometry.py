@@ -18,8 +18,7 @@ from numpy.typing import NDArray
 from pipelines.correlation import equations as eq
 from pipelines.correlation import kernels
 from pipelines.correlation.equations import STILL, Motion
-from pipelines.correlation.judging import MEDIAN_FROM, alarms_over_time, median
-from pipelines.correlation.layout import layout_of
+from pipelines.correlation.judging import Usual, alarms_over_time, median
 from pipelines.correlation.matching import NO_COVARIANCE, Candidate, Matcher, Template
 from pipelines.correlation.settings import Correction, CorrelationSettings
 from pipelines.correlation.step import CorrelationStep
@@ -64,7 +63,7 @@ class CorrelationState:
 
     `template` is the frame that is searched next and `relative` the motion from it to the last frame;
     `previous` is the last frame. `velocity` is the last measured motion between frames, which took
-    `velocity_s`. The tuples at the end are the values behind the running medians.
+    `velocity_s`. `usual` are the running medians over `history` [3, K]: residuals, gradients, intervals.
     """
 
     frames: int = 0
@@ -82,9 +81,10 @@ class CorrelationState:
     segment: Segment = Segment()
     correction_total: tuple[float, float] = (0.0, 0.0)
     height_m: float = math.nan
-    residuals: tuple[float, ...] = ()
-    gradients: tuple[float, ...] = ()
-    intervals_s: tuple[float, ...] = ()
+    mean_grey: float = math.nan
+    gradient: float = math.nan
+    history: Floats | None = None
+    usual: Usual = Usual()
 
 
 class CorrelationOdometry:
@@ -173,7 +173,7 @@ class CorrelationOdometry:
         # a measured motion starts from its template frame, a held one from the frame before
         base = candidate.template if candidate.acceptable else previous
         camera_heading = pose[2] + s.mounting_yaw_rad
-        covariance = _propagated(base, pose, covariance_px, metres_per_px, camera_heading)
+        covariance = kernels.propagated(base.covariance, base.pose, pose, covariance_px, metres_per_px, camera_heading)
         segment = self._correct(state, path_m, dt_s, pose)
         total = (
             state.correction_total[0] + segment.applied_m[0],
@@ -182,13 +182,13 @@ class CorrelationOdometry:
         if segment.applied_m != (0.0, 0.0):
             alarms |= Verdict.CORRECTION_APPLIED
 
-        residual = median(candidate.matches.residual_rms.tolist())
-        gradient = median(candidate.matches.gradient.tolist())
-        alarms |= alarms_over_time(s, residual, state.residuals, gradient, state.gradients, dt_s, state.intervals_s)
+        residual = median(candidate.matches.residual_rms)
+        mean_grey, gradient = kernels.frame_statistics(grey)
+        alarms |= alarms_over_time(s, residual, gradient, dt_s, mean_grey - state.mean_grey, state.usual)
         accepted = candidate.acceptable
         if not accepted:
             alarms |= Verdict.LOST
-        keep = s.median_frames
+        history = self._history(state, *((residual, gradient) if accepted else (math.nan, math.nan)), dt_s)
         new_state = CorrelationState(
             frames=state.frames + 1,
             template=candidate.template if accepted else state.template,
@@ -197,7 +197,7 @@ class CorrelationOdometry:
             relative=relative,
             velocity=motion if accepted else state.velocity,
             velocity_s=dt_s if accepted else state.velocity_s,
-            last_shift=_whole(candidate.shift),
+            last_shift=_whole(candidate.matches.shift_px),
             inliers=candidate.inliers if accepted else state.inliers,
             lost_frames=0 if accepted else state.lost_frames + 1,
             pose=pose,
@@ -205,38 +205,45 @@ class CorrelationOdometry:
             segment=segment,
             correction_total=total,
             height_m=state.height_m,
-            residuals=(*state.residuals, residual)[-keep:] if accepted else state.residuals,
-            gradients=(*state.gradients, gradient)[-keep:] if accepted else state.gradients,
-            intervals_s=(*state.intervals_s, dt_s)[-keep:],
+            mean_grey=mean_grey,
+            gradient=gradient,
+            history=history,
+            usual=Usual(*kernels.running_medians(history)),
         )
         advance = Advance(frame, dt_s, metres_per_px, motion, covariance_px, path_m, increment)
         return new_state, self._record(new_state, sample, grey, candidate, advance, alarms)
 
-    def _find(self, state: CorrelationState, previous: Template, grey: Grey, dt_s: float) -> tuple[Candidate, Verdict]:
+    def _history(self, state: CorrelationState, *latest: float) -> Floats:
+        """The values behind the running medians [3, K] with those of this frame, NaN where there is none."""
+        history = np.full((3, self._settings.median_frames), np.nan) if state.history is None else state.history.copy()
+        history[:, state.frames % self._settings.median_frames] = latest
+        return history
+
+    def _find(self, state: CorrelationState, previous: Template, grey: Grey, dt_s: float) -> tuple[Candidate, int]:
         """The best candidate for the motion to this frame: by prediction, where that fails by a global search."""
         s = self._settings
         step = self._held(state, dt_s) if s.prediction == "constant-velocity" else STILL
         template, predicted = state.template, state.relative.then(step)
         if template is None or not self._serves(state, template, predicted):
             template, predicted = previous, step
-        usual = median(state.residuals) if len(state.residuals) >= MEDIAN_FROM else math.nan
+        usual = state.usual.residual
         first = self._matcher.match(template, grey, predicted, last_shift=state.last_shift, usual_residual=usual)
         if not s.recovery:
-            return first, Verdict.OK
+            return first, 0
         starting = state.velocity is None
         if first.acceptable and not (starting and first.alarms & Verdict.PEAK_AT_BORDER):
-            return first, Verdict.OK
+            return first, 0
         bases = [(template, None)] if template.frame == previous.frame else [(template, None), (previous, step)]
         for base, prediction in bases:
             if prediction is not None:
                 candidate = self._matcher.match(base, grey, prediction, usual_residual=usual)
                 if candidate.acceptable:
-                    return candidate, Verdict.OK
+                    return candidate, 0
             for motion in self._matcher.search_globally(base.grey, grey):
                 candidate = self._matcher.match(base, grey, motion, usual_residual=usual)
                 if candidate.acceptable:
-                    return candidate, Verdict.OK if starting else Verdict.REACQUIRED
-        return first, Verdict.OK
+                    return candidate, 0 if starting else int(Verdict.REACQUIRED)
+        return first, 0
 
     def _serves(self, state: CorrelationState, template: Template, predicted: Motion) -> bool:
         """Whether the template frame may still be searched, or the frame before must take its place."""
@@ -332,10 +339,11 @@ class CorrelationOdometry:
         self, state: CorrelationState, sample: ImageSample, grey: Grey, verdict: Verdict
     ) -> tuple[CorrelationState, CorrelationStep]:
         """Begin, or begin again after the image size changed: there is nothing to compare this frame with."""
-        layout_of(self._settings, grey.shape[1], grey.shape[0])
+        self._matcher.layout(grey.shape[1], grey.shape[0])
         assert state.covariance is not None
         frame = _frame_of(state, sample)
         this = Template(frame, grey, state.pose, state.covariance)
+        mean_grey, gradient = kernels.frame_statistics(grey)
         new = replace(
             state,
             frames=state.frames + 1,
@@ -346,6 +354,8 @@ class CorrelationOdometry:
             velocity=None,
             velocity_s=math.nan,
             last_shift=None,
+            mean_grey=mean_grey,
+            gradient=gradient,
         )
         return new, self._blank(new, sample, grey, verdict)
 
@@ -368,16 +378,13 @@ class CorrelationOdometry:
         count, tiles = s.columns * s.rows, s.tile_columns * s.tile_rows
         matches = kernels.no_matches(count, s.search_radius_px)
         nothing = np.full((count, 2), np.nan)
+        matches.weight[:] = 0.0
         candidate = Candidate(
             template=Template(-1, grey, state.pose, NO_COVARIANCE),
             motion=Motion(math.nan, math.nan, math.nan, math.nan),
             predicted_shift=nothing,
             search=nothing,
             matches=matches,
-            texture=kernels.texture_of(matches, s.fragment_side_px),
-            shift=nothing,
-            weight=np.zeros(count),
-            residual=nothing,
             inliers=0,
             tile_shift=np.full((tiles, 2), np.nan),
             tile_weight=np.zeros(tiles),
@@ -400,17 +407,17 @@ class CorrelationOdometry:
         grey: Grey,
         candidate: Candidate,
         advance: Advance,
-        alarms: Verdict,
+        alarms: int,
     ) -> CorrelationStep:
         """Everything that was computed for this frame; `state` is the one after it."""
         s = self._settings
-        m, texture, motion = candidate.matches, candidate.texture, candidate.motion
+        m, motion, flags = candidate.matches, candidate.motion, Verdict(int(alarms))
         height, width = grey.shape
         if grey.size:
-            layout = layout_of(s, width, height)
+            layout = self._matcher.layout(width, height)
             fragments, points, tiles = layout.centres, layout.points, layout.tile_centres
         else:
-            fragments = points = np.full(candidate.shift.shape, np.nan)
+            fragments = points = np.full(m.shift_px.shape, np.nan)
             tiles = np.full(candidate.tile_shift.shape, np.nan)
         x, y, heading = state.pose
         total_x, total_y = state.correction_total
@@ -420,14 +427,14 @@ class CorrelationOdometry:
             frame=advance.frame,
             t_ns=sample.t_ns,
             received_ns=sample.received_ns,
-            verdict=gravest(alarms),
-            alarms=alarms,
+            verdict=gravest(flags),
+            alarms=flags,
             accepted=candidate.acceptable,
             template_frame=candidate.template.frame,
             dt_s=advance.dt_s,
             image_size_px=np.array([width, height], np.float64),
-            mean_grey=median(m.mean_grey.tolist()),
-            gradient_energy=median(m.gradient.tolist()),
+            mean_grey=state.mean_grey,
+            gradient_energy=state.gradient,
             fragment_side_px=s.fragment_side_px,
             search_radius_px=s.search_radius_px,
             fragment_px=_floats(fragments),
@@ -438,23 +445,25 @@ class CorrelationOdometry:
             peak_correlation=m.peak_correlation,
             second_peak_px=m.second_peak_px,
             second_peak_correlation=m.second_peak_correlation,
-            peak_ratio=texture.peak_ratio,
+            peak_ratio=m.peak_ratio,
             peak_curvature=m.peak_curvature,
             peak_anisotropy=m.peak_anisotropy,
             delta_px=m.delta_px,
             hessian=m.hessian,
-            condition=texture.condition,
-            smallest_eigenvalue=texture.smallest_eigenvalue,
+            condition=m.condition,
+            smallest_eigenvalue=m.smallest_eigenvalue,
             iterations=m.iterations,
             gain=m.gain,
             offset=m.offset,
+            match_grey=m.mean_grey,
+            gradient=m.gradient,
             residual_rms=m.residual_rms,
-            sigma_px=texture.sigma_px,
-            shift_px=candidate.shift,
-            weight=candidate.weight,
-            fit_residual_px=candidate.residual,
+            sigma_px=m.sigma_px,
+            shift_px=m.shift_px,
+            weight=m.weight,
+            fit_residual_px=m.fit_residual_px,
             inliers=candidate.inliers,
-            rigidity_px=kernels.worst_rigidity(points, candidate.shift),
+            rigidity_px=kernels.worst_rigidity(points, m.shift_px),
             scale=motion.scale,
             centre_shift_px=np.array([motion.u, motion.v]),
             template_rotation_rad=motion.rotation_rad,
@@ -513,21 +522,8 @@ def _same_image(a: Grey, b: Grey) -> bool:
 
 def _whole(shift: Floats) -> Floats:
     """Shifts rounded to whole pixels, zero where there is none: the centres of the next search."""
-    return np.floor(np.nan_to_num(shift) + 0.5)
+    return np.where(np.isfinite(shift), np.floor(shift + 0.5), 0.0)
 
 
 def _floats(pixels: NDArray[np.int64] | Floats) -> Floats:
     return pixels.astype(np.float64)
-
-
-def _propagated(base: Template, pose: Pose, covariance_px: Floats, metres_per_px: float, heading_rad: float) -> Floats:
-    """Covariance [3, 3] of the pose from that at `base` and that of the motion from there, in px and rad.
-
-    P' = F P Fᵀ + G Q Gᵀ, linearised about the motion: F carries the heading's error over the distance driven,
-    G turns the shift in px (u, v) and the rotation into the world.
-    """
-    east, north = pose[0] - base.pose[0], pose[1] - base.pose[1]
-    c, s = metres_per_px * math.cos(heading_rad), metres_per_px * math.sin(heading_rad)
-    F = np.array([[1.0, 0.0, -north], [0.0, 1.0, east], [0.0, 0.0, 1.0]])
-    G = np.array([[-c, -s, -north], [-s, c, east], [0.0, 0.0, 1.0]])
-    return F @ base.covariance @ F.T + G @ covariance_px @ G.T

@@ -122,7 +122,6 @@ class CorrelationSettings(BaseModel):
     max_rigidity_px: Positive = Field(1.0, description="NOT_RIGID above, for two fragments")
     max_scale_change: Positive = Field(0.01, description="HEIGHT_CHANGE above, of |scale - 1|")
     max_residual_ratio: Positive = Field(3.0, description="RESIDUAL_HIGH above this multiple of the running median")
-    gain_limits: tuple[Positive, Positive] = Field((0.9, 1.1), description="EXPOSURE_JUMP outside")
     max_level_change: Positive = Field(8.0, description="EXPOSURE_JUMP above, change of the mean grey level")
     min_gradient_ratio: Fraction = Field(0.5, description="BLURRED below this share of the running median")
     gap_factor: Positive = Field(1.6, description="FRAME_GAP above this multiple of the running median of dt")
