@@ -25,6 +25,8 @@ POLE = 3.0**0.5 - 2.0
 """Pole of the cubic B-spline's prefilter."""
 PREFILTER_MARGIN = 8
 """Pixels around a patch after which the prefilter has forgotten the border (POLE^8 = 3e-5)."""
+ZERO, ONE, TWO, THREE = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
+"""Indices of inner loops are unsigned: signed ones cost a test for a negative index, and keep loops from vectors."""
 MEDIAN_FROM = 5
 """A running median counts from this many values on."""
 QUANTISATION = 0.3
@@ -92,7 +94,7 @@ class Fit(NamedTuple):
 _jit: Any = njit(cache=True, nogil=True, error_model="numpy")
 
 
-def matches_of(surface, hessian, block):  # type: ignore[no-untyped-def]
+def matches_of(surface: Floats32, hessian: Floats, block: Floats) -> Matches:
     """The named views of a block; the same for Python and for compiled code."""
     return Matches(
         surface,
@@ -128,8 +130,7 @@ _matches_of = _jit(matches_of)
 def no_matches(count: int, radius: int) -> Matches:
     """Matches of `count` fragments in which nothing was found yet: all NaN."""
     surface = np.full((count, 2 * radius + 1, 2 * radius + 1), np.nan, np.float32)
-    matches: Matches = matches_of(surface, np.full((count, 2, 2), np.nan), np.full((count, VALUES), np.nan))
-    return matches
+    return matches_of(surface, np.full((count, 2, 2), np.nan), np.full((count, VALUES), np.nan))
 
 
 # ------------------------------------------------------------------------- patches and splines
@@ -223,55 +224,43 @@ def _basis(f):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def templates(coefficients, count, side, rotation_rad):  # type: ignore[no-untyped-def]
+def templates(coefficients, side, rotation_rad):  # type: ignore[no-untyped-def]
     """Sample every fragment, turned by `rotation_rad`, with its gradient in the turned axes.
 
     T(q) = I(p + R(-ψ) q): the content of the template frame as it looks after a rotation by ψ. Returns float32
-    [3, F, N, N]: grey levels, slope along u, slope along v.
+    [3, N, N, lanes]: grey levels, slope along u, slope along v.
     """
     half = (side - 1) // 2
     middle = np.float32((coefficients.shape[0] - 1) // 2)
     lanes = coefficients.shape[2]
     cos, sin = np.float32(np.cos(rotation_rad)), np.float32(np.sin(rotation_rad))
-    sampled = np.empty((3, count, side, side), np.float32)
-    row = np.empty((3, side, lanes), np.float32)
+    sampled = np.zeros((3, side, side, lanes), np.float32)
+    width = np.uint64(lanes)
     for y in range(side):
-        qv = np.float32(y - half)
+        qv, row = np.float32(y - half), np.uint64(y)
         for x in range(side):
-            qu = np.float32(x - half)
+            qu, column = np.float32(x - half), np.uint64(x)
             u, v = middle + cos * qu + sin * qv, middle - sin * qu + cos * qv
             iu, iv = int(u), int(v)
             u0, u1, u2, u3, e0, e1, e2, e3 = _basis(u - np.float32(iu))
             v0, v1, v2, v3, f0, f1, f2, f3 = _basis(v - np.float32(iv))
-            grey, slope_u, slope_v = row[0, x], row[1, x], row[2, x]
+            left = np.uint64(iu - 1)
             for k in range(4):
                 wv = v0 if k == 0 else (v1 if k == 1 else (v2 if k == 2 else v3))
                 dv = f0 if k == 0 else (f1 if k == 1 else (f2 if k == 2 else f3))
-                c0, c1 = coefficients[iv + k - 1, iu - 1], coefficients[iv + k - 1, iu]
-                c2, c3 = coefficients[iv + k - 1, iu + 1], coefficients[iv + k - 1, iu + 2]
-                if k == 0:
-                    for lane in range(lanes):
-                        along = (u0 * c0[lane] + u1 * c1[lane]) + (u2 * c2[lane] + u3 * c3[lane])
-                        slope = (e0 * c0[lane] + e1 * c1[lane]) + (e2 * c2[lane] + e3 * c3[lane])
-                        grey[lane] = wv * along
-                        slope_u[lane] = wv * slope
-                        slope_v[lane] = dv * along
-                else:
-                    for lane in range(lanes):
-                        along = (u0 * c0[lane] + u1 * c1[lane]) + (u2 * c2[lane] + u3 * c3[lane])
-                        slope = (e0 * c0[lane] + e1 * c1[lane]) + (e2 * c2[lane] + e3 * c3[lane])
-                        grey[lane] += wv * along
-                        slope_u[lane] += wv * slope
-                        slope_v[lane] += dv * along
-            for lane in range(lanes):
-                gu, gv = slope_u[lane], slope_v[lane]
-                slope_u[lane] = cos * gu - sin * gv
-                slope_v[lane] = sin * gu + cos * gv
-        for part in range(3):
-            for i in range(count):
-                target = sampled[part, i, y]
-                for x in range(side):
-                    target[x] = row[part, x, i]
+                line = np.uint64(iv - 1 + k)
+                for lane in range(width):
+                    c0, c1 = coefficients[line, left, lane], coefficients[line, left + ONE, lane]
+                    c2, c3 = coefficients[line, left + TWO, lane], coefficients[line, left + THREE, lane]
+                    along = (u0 * c0 + u1 * c1) + (u2 * c2 + u3 * c3)
+                    slope = (e0 * c0 + e1 * c1) + (e2 * c2 + e3 * c3)
+                    sampled[ZERO, row, column, lane] += wv * along
+                    sampled[ONE, row, column, lane] += wv * slope
+                    sampled[TWO, row, column, lane] += dv * along
+            for lane in range(width):
+                gu, gv = sampled[ONE, row, column, lane], sampled[TWO, row, column, lane]
+                sampled[ONE, row, column, lane] = cos * gu - sin * gv
+                sampled[TWO, row, column, lane] = sin * gu + cos * gv
     return sampled
 
 
@@ -298,42 +287,38 @@ def _cardinal_weights(fraction, weights):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def _shifted(image, u, v, side, window, rows, out, weights_u, weights_v):  # type: ignore[no-untyped-def]
+def _shifted(image, u, v, work, out, lane):  # type: ignore[no-untyped-def]
     """Sample the N x N pixels around the real position (u, v) by the cubic spline through the image.
+
+    Fills one lane of `out` [N, N, lanes].
 
     All pixels share one subpixel fraction, so the spline is a separable filter of TAPS taps.
     """
+    side = out.shape[0]
     half = (side - 1) // 2
+    window, row, target = work.window, work.row, work.line
+    weights_u, weights_v = work.weights_u, work.weights_v
     iu, iv = int(np.floor(u)), int(np.floor(v))
     _cardinal_weights(u - iu, weights_u)
     _cardinal_weights(v - iv, weights_v)
     before = TAPS // 2 - 1
     _copy_window(image, iv - half - before, iu - half - before, window)
-    width = window.shape[1]
-    for y in range(side):
-        row = rows[y]
+    width, size = np.uint64(window.shape[1]), np.uint64(side)
+    for y in range(size):
         for x in range(width):
             row[x] = 0.0
-        for k in range(0, TAPS, 4):
-            w0, w1 = np.float32(weights_v[k]), np.float32(weights_v[k + 1])
-            w2, w3 = np.float32(weights_v[k + 2]), np.float32(weights_v[k + 3])
-            s0, s1, s2, s3 = window[y + k], window[y + k + 1], window[y + k + 2], window[y + k + 3]
+        for k in range(ZERO, np.uint64(TAPS), THREE):
+            w0, w1, w2 = np.float32(weights_v[k]), np.float32(weights_v[k + ONE]), np.float32(weights_v[k + TWO])
             for x in range(width):
-                row[x] += (w0 * s0[x] + w1 * s1[x]) + (w2 * s2[x] + w3 * s3[x])
-        target = out[y]
-        for x in range(side):
+                row[x] += w0 * window[y + k, x] + w1 * window[y + k + ONE, x] + w2 * window[y + k + TWO, x]
+        for x in range(size):
             target[x] = 0.0
-        for k in range(0, TAPS, 4):
-            w0, w1 = np.float32(weights_u[k]), np.float32(weights_u[k + 1])
-            w2, w3 = np.float32(weights_u[k + 2]), np.float32(weights_u[k + 3])
-            s0, s1, s2, s3 = (
-                row[k : k + side],
-                row[k + 1 : k + 1 + side],
-                row[k + 2 : k + 2 + side],
-                row[k + 3 : k + 3 + side],
-            )
-            for x in range(side):
-                target[x] += (w0 * s0[x] + w1 * s1[x]) + (w2 * s2[x] + w3 * s3[x])
+        for k in range(ZERO, np.uint64(TAPS), THREE):
+            w0, w1, w2 = np.float32(weights_u[k]), np.float32(weights_u[k + ONE]), np.float32(weights_u[k + TWO])
+            for x in range(size):
+                target[x] += w0 * row[x + k] + w1 * row[x + k + ONE] + w2 * row[x + k + TWO]
+        for x in range(size):
+            out[y, x, lane] = target[x]
 
 
 # ---------------------------------------------------------------- 1. integer shift (2), (3)
@@ -383,41 +368,45 @@ def correlation_surface(template, image, u, v, radius, surface):  # type: ignore
             column[x] += p
             column_sq[x] += p * p
     total = np.empty(padded, np.float32)
+    spread = np.empty(padded, np.float32)
+    lanes, taps = np.uint64(padded), np.uint64(side)
     for j in range(positions):
-        for x in range(padded):
+        for x in range(lanes):
             total[x] = 0.0
-        for y in range(side):
-            row, taps = grey[j + y], centred[y]
-            k = 0
-            while k + 3 <= side:
-                t0, t1, t2 = taps[k], taps[k + 1], taps[k + 2]
-                r0, r1, r2 = row[k : k + padded], row[k + 1 : k + 1 + padded], row[k + 2 : k + 2 + padded]
-                for x in range(padded):
-                    total[x] += t0 * r0[x] + t1 * r1[x] + t2 * r2[x]
-                k += 3
-            while k < side:
-                t0 = taps[k]
-                r0 = row[k : k + padded]
-                for x in range(padded):
-                    total[x] += t0 * r0[x]
-                k += 1
+        for y in range(taps):
+            line = np.uint64(j) + y
+            k = ZERO
+            while k + THREE <= taps:
+                t0, t1, t2 = centred[y, k], centred[y, k + ONE], centred[y, k + TWO]
+                for x in range(lanes):
+                    total[x] += t0 * grey[line, x + k] + t1 * grey[line, x + k + ONE] + t2 * grey[line, x + k + TWO]
+                k += THREE
+            while k < taps:
+                t0 = centred[y, k]
+                for x in range(lanes):
+                    total[x] += t0 * grey[line, x + k]
+                k += ONE
         box, box_sq = np.int64(0), np.int64(0)
-        for x in range(side):
+        for x in range(side - 1):
             box += column[x]
             box_sq += column_sq[x]
-        top = v + j - radius - half
         for i in range(positions):
-            left = u + i - radius - half
-            variance = box_sq * n - box * box
-            if top < 0 or left < 0 or top + side > height or left + side > width:
-                surface[j, i] = np.nan
-            elif variance == 0 or energy < 1e-3 * n:
-                surface[j, i] = 0.0
-            else:
-                surface[j, i] = total[i] / np.sqrt(energy * (variance / n))
-            if i + 1 < positions:
-                box += column[i + side] - column[i]
-                box_sq += column_sq[i + side] - column_sq[i]
+            box += column[i + side - 1]
+            box_sq += column_sq[i + side - 1]
+            spread[i] = energy * ((box_sq * n - box * box) / n)
+            box -= column[i]
+            box_sq -= column_sq[i]
+        row = surface[j]
+        for i in range(positions):
+            # a flat window or template has no correlation
+            row[i] = total[i] / np.sqrt(spread[i]) if spread[i] > np.float32(1e-3) else np.float32(0.0)
+        top = v + j - radius - half
+        if top < 0 or top + side > height:
+            row[:] = np.nan
+        for i in range(min(max(half + radius - u, 0), positions)):
+            row[i] = np.nan
+        for i in range(max(width - side + half + radius - u + 1, 0), positions):
+            row[i] = np.nan
         if j + 1 < positions:
             for x in range(size):
                 new, old = np.int64(pixels[j + side, x]), np.int64(pixels[j, x])
@@ -524,11 +513,11 @@ def one_step(previous, image, u, v, peak_u, peak_v, side, hessian):  # type: ign
 
 
 class _Scratch(NamedTuple):
-    """Work space of the iterated refinement, so that no iteration allocates."""
+    """Work space of the sampling, so that no iteration allocates."""
 
     window: Floats32
-    rows: Floats32
-    sampled: Floats32
+    row: Floats32
+    line: Floats32
     weights_u: Floats
     weights_v: Floats
 
@@ -538,130 +527,166 @@ def _scratch(side):  # type: ignore[no-untyped-def]
     width = side + TAPS - 1
     return _Scratch(
         np.empty((width, width), np.float32),
-        np.empty((side, width), np.float32),
-        np.empty((side, side), np.float32),
+        np.empty(width, np.float32),
+        np.empty(side, np.float32),
         np.empty(TAPS),
         np.empty(TAPS),
     )
 
 
-@_jit
-def _lines(a, b):  # type: ignore[no-untyped-def]
-    """Σ a b over two float32 arrays [N, N]: eight running sums a line, joined in float64.
+MIDDLE_GREY = 128.0
+"""Subtracted from grey levels before they are summed, to keep the sums small."""
 
-    The order of the sums is fixed by the code, so that the result does not depend on the machine.
+
+@_jit
+def _template_sums(t):  # type: ignore[no-untyped-def]
+    """Sums over a fragment's pixels, per lane: T, U, V, TT, UT, VT, UU, UV, VV (U, V the slopes), float64 [9, lanes].
+
+    Lines are summed in float32, lanes side by side, and joined in float64: always in the same order.
     """
-    total = 0.0
-    lanes = np.empty(8, np.float32)
-    rows, columns = a.shape
-    whole = columns // 8 * 8
-    for y in range(rows):
-        ra, rb = a[y], b[y]
-        for k in range(8):
-            lanes[k] = 0.0
-        for x in range(0, whole, 8):
-            sa, sb = ra[x : x + 8], rb[x : x + 8]
-            for k in range(8):
-                lanes[k] += sa[k] * sb[k]
-        rest = np.float32(0.0)
-        for x in range(whole, columns):
-            rest += ra[x] * rb[x]
-        total += float(
-            ((lanes[0] + lanes[1]) + (lanes[2] + lanes[3])) + ((lanes[4] + lanes[5]) + (lanes[6] + lanes[7])) + rest
-        )
-    return total
+    _, side, _, lanes = t.shape
+    sums = np.zeros((9, lanes))
+    line = np.empty((9, lanes), np.float32)
+    s0, s1, s2, s3, s4 = line[0], line[1], line[2], line[3], line[4]
+    s5, s6, s7, s8 = line[5], line[6], line[7], line[8]
+    width = np.uint64(lanes)
+    middle = np.float32(MIDDLE_GREY)
+    for y in range(side):
+        line[:] = 0.0
+        for x in range(side):
+            row, column = np.uint64(y), np.uint64(x)
+            for lane in range(width):
+                g = t[ZERO, row, column, lane] - middle
+                u, v = t[ONE, row, column, lane], t[TWO, row, column, lane]
+                s0[lane] += g
+                s1[lane] += u
+                s2[lane] += v
+                s3[lane] += g * g
+                s4[lane] += u * g
+                s5[lane] += v * g
+                s6[lane] += u * u
+                s7[lane] += u * v
+                s8[lane] += v * v
+        for k in range(9):
+            for lane in range(lanes):
+                sums[k, lane] += line[k, lane]
+    return sums
 
 
 @_jit
-def _mean(a):  # type: ignore[no-untyped-def]
-    """Mean of a float32 array [N, N]: sums of lines joined in float64."""
-    total = 0.0
-    rows, columns = a.shape
-    for y in range(rows):
-        row = a[y]
-        line = np.float32(0.0)
-        for x in range(columns):
-            line += row[x]
-        total += line
-    return total / (rows * columns)
+def _match_sums(t, sampled, sums):  # type: ignore[no-untyped-def]
+    """Sums over a fragment's pixels, per lane: I, II, IT, IU, IV, into float64 [5, lanes]; see `_template_sums`."""
+    _, side, _, lanes = t.shape
+    sums[:] = 0.0
+    line = np.empty((5, lanes), np.float32)
+    width = np.uint64(lanes)
+    s0, s1, s2, s3, s4 = line[0], line[1], line[2], line[3], line[4]
+    middle = np.float32(MIDDLE_GREY)
+    for y in range(side):
+        line[:] = 0.0
+        for x in range(side):
+            row, column = np.uint64(y), np.uint64(x)
+            for lane in range(width):
+                i, g = sampled[row, column, lane] - middle, t[ZERO, row, column, lane] - middle
+                s0[lane] += i
+                s1[lane] += i * i
+                s2[lane] += i * g
+                s3[lane] += i * t[ONE, row, column, lane]
+                s4[lane] += i * t[TWO, row, column, lane]
+        for k in range(5):
+            for lane in range(lanes):
+                sums[k, lane] += line[k, lane]
 
 
 @_jit
-def _centre(a):  # type: ignore[no-untyped-def]
-    """Subtract the mean of a float32 array [N, N] in place; return the mean."""
-    mean = _mean(a)
-    m = np.float32(mean)
-    for y in range(a.shape[0]):
-        row = a[y]
-        for x in range(a.shape[1]):
-            row[x] -= m
-    return mean
+def refine(t, image, base, delta, gain_and_offset, limit, tolerance, hessian, outcome):  # type: ignore[no-untyped-def]
+    """Iterated inverse-compositional refinement of all fragments on a cubic spline.
 
+    Minimises Σ (I(p + d + q) - g T(q) - b)² over the shift d, and over gain g and offset b where asked, for
+    each fragment. The gradient is that of the template, so its sums serve all iterations; gain and offset are
+    eliminated in closed form. All fragments step together until each step is below `tolerance` (px).
 
-@_jit
-def refine(  # type: ignore[no-untyped-def]
-    grey, slope_u, slope_v, image, u, v, du, dv, gain_and_offset, limit, tolerance, work, hessian
-):
-    """Iterated inverse-compositional refinement on a cubic spline.
-
-    Minimises Σ (I(p + d + q) - g T(q) - b)² over the shift d, and over gain g and offset b where asked; T and its
-    slopes [N, N] come from `templates` and are used up. The gradient is that of the template, so one Hessian serves all
-    iterations; gain and offset are projected out, so that they cost nothing in an iteration. (du, dv) is the
-    start, relative to the integer position (u, v) in the image.
-
-    Returns (δu, δv, iterations, g, b, rms of the residual in grey, mean grey of the match); `hessian` [2, 2]
-    receives I_xyᵀ I_xy of the template in grey²/px².
+    Args:
+        t: float32 [3, N, N, lanes] from `templates`.
+        image: uint8 [height, width].
+        base: float64 [F, 2], whole-pixel position (u, v) of each fragment in the image; NaN to leave it out.
+        delta: float64 [F, 2], the start relative to `base` (px); receives the result, NaN without texture.
+        gain_and_offset: whether to estimate gain and offset, else 1 and 0.
+        limit: most iterations.
+        tolerance: end of the iteration (px).
+        hessian: float64 [F, 2, 2], receives I_xyᵀ I_xy of the template (grey²/px²).
+        outcome: float64 [F, 5], receives iterations, gain, offset, rms of the residual, mean grey of the match.
     """
-    side = grey.shape[0]
+    count, side = len(base), t.shape[1]
     n = side * side
-    hessian[0, 0], hessian[1, 1] = _lines(slope_u, slope_u), _lines(slope_v, slope_v)
-    hessian[0, 1] = hessian[1, 0] = _lines(slope_u, slope_v)
-    mean = 0.0
-    energy = 0.0
-    if gain_and_offset:
-        mean = _centre(grey)
-        energy = _lines(grey, grey)
-        _centre(slope_u)
-        _centre(slope_v)
-        if energy > 0.0:
-            along_u, along_v = np.float32(_lines(slope_u, grey) / energy), np.float32(_lines(slope_v, grey) / energy)
-            for y in range(side):
-                for x in range(side):
-                    slope_u[y, x] -= along_u * grey[y, x]
-                    slope_v[y, x] -= along_v * grey[y, x]
-    uu, uv, vv = _lines(slope_u, slope_u), _lines(slope_u, slope_v), _lines(slope_v, slope_v)
-    det = uu * vv - uv * uv
-    gain, offset, rms, level = 1.0, 0.0, np.nan, np.nan
-    if not det > 1e-6 * (uu + vv) ** 2 or uu + vv < 1e-3 * n:
-        return np.nan, np.nan, 0, np.nan, np.nan, np.nan, np.nan
-    iteration = 0
-    sampled = work.sampled
-    start_u, start_v = du, dv
-    while iteration < limit:
-        iteration += 1
-        _shifted(image, u + du, v + dv, side, work.window, work.rows, sampled, work.weights_u, work.weights_v)
+    sums = _template_sums(t)
+    work = _scratch(side)
+    sampled = np.zeros(t.shape[1:], np.float32)
+    found = np.empty((5, t.shape[3]))
+    active = np.zeros(count, np.bool_)
+    inverse = np.empty((count, 3))
+    start = delta.copy()
+    for i in range(count):
+        outcome[i, 0] = 0.0
+        if not np.isfinite(base[i, 0] + delta[i, 0]):
+            continue
+        hessian[i, 0, 0], hessian[i, 1, 1] = sums[6, i], sums[8, i]
+        hessian[i, 0, 1] = hessian[i, 1, 0] = sums[7, i]
+        uu, uv, vv = sums[6, i], sums[7, i], sums[8, i]
         if gain_and_offset:
-            level = _centre(sampled)
-            gain = _lines(sampled, grey) / energy
-            offset = level - gain * mean
-            total = _lines(sampled, sampled)
-            rms = np.sqrt(max(total - gain * gain * energy, 0.0) / n)
-            if not abs(gain) > 1e-3:
-                break
-        else:
-            level = _mean(sampled)
-            for y in range(side):
-                for x in range(side):
-                    sampled[y, x] -= grey[y, x]
-            rms = np.sqrt(_lines(sampled, sampled) / n)
-        bu, bv = _lines(slope_u, sampled) / gain, _lines(slope_v, sampled) / gain
-        step_u, step_v = (vv * bu - uv * bv) / det, (uu * bv - uv * bu) / det
-        du -= step_u
-        dv -= step_v
-        step = np.sqrt(step_u * step_u + step_v * step_v)
-        if step < tolerance or abs(du - start_u) > 3.0 or abs(dv - start_v) > 3.0:
+            g, u, v = sums[0, i], sums[1, i], sums[2, i]
+            gg, ug, vg = sums[3, i] - g * g / n, sums[4, i] - u * g / n, sums[5, i] - v * g / n
+            if gg <= 0.0:
+                delta[i] = np.nan
+                continue
+            uu -= u * u / n + ug * ug / gg
+            uv -= u * v / n + ug * vg / gg
+            vv -= v * v / n + vg * vg / gg
+        det = uu * vv - uv * uv
+        if not det > 1e-6 * (uu + vv) ** 2 or uu + vv < 1e-3 * n:
+            delta[i] = np.nan
+            continue
+        inverse[i, 0], inverse[i, 1], inverse[i, 2] = vv / det, -uv / det, uu / det
+        active[i] = True
+    for _ in range(limit):
+        if not active.any():
             break
-    return du, dv, iteration, gain, offset, rms, level
+        for i in range(count):
+            if active[i]:
+                _shifted(image, base[i, 0] + delta[i, 0], base[i, 1] + delta[i, 1], work, sampled, i)
+        _match_sums(t, sampled, found)
+        for i in range(count):
+            if not active[i]:
+                continue
+            outcome[i, 0] += 1.0
+            image_sum, image_sq = found[0, i], found[1, i]
+            along, bu, bv = found[2, i], found[3, i], found[4, i]
+            g, gg = sums[0, i], sums[3, i]
+            gain, offset = 1.0, 0.0
+            if gain_and_offset:
+                gg -= g * g / n
+                along -= image_sum * g / n
+                gain = along / gg
+                offset = (image_sum - gain * g) / n + MIDDLE_GREY * (1.0 - gain)
+                rest = image_sq - image_sum * image_sum / n - gain * gain * gg
+                bu -= image_sum * sums[1, i] / n + gain * (sums[4, i] - sums[1, i] * g / n)
+                bv -= image_sum * sums[2, i] / n + gain * (sums[5, i] - sums[2, i] * g / n)
+            else:
+                rest = image_sq - 2.0 * along + gg
+                bu -= sums[4, i]
+                bv -= sums[5, i]
+            outcome[i, 1], outcome[i, 2] = gain, offset
+            outcome[i, 3], outcome[i, 4] = np.sqrt(max(rest, 0.0) / n), image_sum / n + MIDDLE_GREY
+            if not abs(gain) > 1e-3:
+                delta[i] = np.nan
+                active[i] = False
+                continue
+            step_u = (inverse[i, 0] * bu + inverse[i, 1] * bv) / gain
+            step_v = (inverse[i, 1] * bu + inverse[i, 2] * bv) / gain
+            delta[i, 0] -= step_u
+            delta[i, 1] -= step_v
+            strayed = max(abs(delta[i, 0] - start[i, 0]), abs(delta[i, 1] - start[i, 1])) > 3.0
+            active[i] = not (step_u * step_u + step_v * step_v < tolerance * tolerance or strayed)
 
 
 @_jit
@@ -735,13 +760,16 @@ def match_iterated(  # type: ignore[no-untyped-def]
     `coefficients` float32 [S, S, lanes] from `spline_patches`; the rest as in `match_one_step`.
     """
     m = _matches_of(surface, hessian, block)
-    work = _scratch(side)
-    t = templates(coefficients, centres.shape[0], side, rotation_rad)
-    for i in range(centres.shape[0]):
-        correlation_surface(t[0, i], image, search[i, 0], search[i, 1], radius, m.surface[i])
+    t = templates(coefficients, side, rotation_rad)
+    template = np.empty((side, side), np.float32)
+    for i in range(len(centres)):
+        for y in range(side):
+            for x in range(side):
+                template[y, x] = t[0, y, x, i]
+        correlation_surface(template, image, search[i, 0], search[i, 1], radius, m.surface[i])
         m.iterations[i] = 0
-        if _note_peaks(m, i, centres, search, radius):
-            _refine_match(m, i, t, image, centres, gain_and_offset, limit, tolerance, work)
+        _note_peaks(m, i, centres, search, radius)
+    _refine_matches(m, t, image, centres, gain_and_offset, limit, tolerance)
 
 
 @_jit
@@ -750,24 +778,23 @@ def refine_again(  # type: ignore[no-untyped-def]
 ):
     """Refine matches once more, from where they are, with templates turned by a better rotation."""
     m = _matches_of(surface, hessian, block)
-    work = _scratch(side)
-    t = templates(coefficients, centres.shape[0], side, rotation_rad)
-    for i in range(centres.shape[0]):
-        if np.isfinite(m.delta_px[i, 0]):
-            _refine_match(m, i, t, image, centres, gain_and_offset, limit, tolerance, work)
+    t = templates(coefficients, side, rotation_rad)
+    _refine_matches(m, t, image, centres, gain_and_offset, limit, tolerance)
 
 
 @_jit
-def _refine_match(m, i, t, image, centres, gain_and_offset, limit, tolerance, work):  # type: ignore[no-untyped-def]
-    u, v = centres[i, 0] + m.peak_px[i, 0], centres[i, 1] + m.peak_px[i, 1]
-    du, dv, iterations, gain, offset, rms, level = refine(
-        t[0, i], t[1, i], t[2, i], image, u, v, m.delta_px[i, 0], m.delta_px[i, 1], gain_and_offset, limit,
-        tolerance, work, m.hessian[i],
-    )  # fmt: skip
-    m.delta_px[i, 0], m.delta_px[i, 1] = du, dv
-    m.iterations[i] += iterations
-    m.gain[i], m.offset[i], m.residual_rms[i], m.mean_grey[i] = gain, offset, rms, level
-    _note_texture(m, i, t.shape[2] * t.shape[3])
+def _refine_matches(m, t, image, centres, gain_and_offset, limit, tolerance):  # type: ignore[no-untyped-def]
+    count, side = len(centres), t.shape[1]
+    outcome = np.full((count, 5), np.nan)
+    delta = m.delta_px.copy()
+    refine(t, image, centres + m.peak_px, delta, gain_and_offset, limit, tolerance, m.hessian, outcome)
+    for i in range(count):
+        m.delta_px[i] = delta[i]
+        m.iterations[i] += outcome[i, 0]
+        m.gain[i], m.offset[i], m.residual_rms[i], m.mean_grey[i] = (
+            outcome[i, 1], outcome[i, 2], outcome[i, 3], outcome[i, 4]
+        )  # fmt: skip
+        _note_texture(m, i, side * side)
 
 
 @_jit
@@ -788,9 +815,9 @@ def _note_texture(m, i, pixels):  # type: ignore[no-untyped-def]
 
 @_jit
 def refine_tiles(  # type: ignore[no-untyped-def]
-    coefficients, image, centres, points, shift_u, shift_v, rotation_rad, scale, side, gain_and_offset, limit, tolerance
+    coefficients, image, centres, points, shift_u, shift_v, rotation_rad, scale, side, gain_and_offset
 ):
-    """Refine many tiles of the frame from a known rigid motion: the photometric step after the fragments.
+    """One refinement step of many tiles from a known motion: the photometric step after the fragments.
 
     `centres` int64 [T, 2] (u, v), `points` [T, 2] the same from the image centre. Returns (shift [T, 2],
     hessian [T, 2, 2], rms [T]); NaN where a tile leaves the image or has no texture.
@@ -798,37 +825,20 @@ def refine_tiles(  # type: ignore[no-untyped-def]
     count = centres.shape[0]
     height, width = image.shape
     half = (side - 1) // 2
-    shifts = np.full((count, 2), np.nan)
     hessians = np.full((count, 2, 2), np.nan)
-    rms = np.full(count, np.nan)
+    outcome = np.full((count, 5), np.nan)
+    base, delta = np.full((count, 2), np.nan), np.full((count, 2), np.nan)
     cos, sin = scale * np.cos(rotation_rad), scale * np.sin(rotation_rad)
-    work = _scratch(side)
-    t = templates(coefficients, count, side, rotation_rad)
     for i in range(count):
         pu, pv = points[i]
         u = cos * pu - sin * pv + shift_u + centres[i, 0] - pu
         v = sin * pu + cos * pv + shift_v + centres[i, 1] - pv
-        if u < half or v < half or u > width - 1 - half or v > height - 1 - half:
-            continue
-        iu, iv = np.floor(u + 0.5), np.floor(v + 0.5)
-        du, dv, _, _, _, residual, _ = refine(
-            t[0, i],
-            t[1, i],
-            t[2, i],
-            image,
-            iu,
-            iv,
-            u - iu,
-            v - iv,
-            gain_and_offset,
-            limit,
-            tolerance,
-            work,
-            hessians[i],
-        )
-        shifts[i, 0], shifts[i, 1] = iu + du - centres[i, 0], iv + dv - centres[i, 1]
-        rms[i] = residual
-    return shifts, hessians, rms
+        if u >= half and v >= half and u <= width - 1 - half and v <= height - 1 - half:
+            base[i, 0], base[i, 1] = np.floor(u + 0.5), np.floor(v + 0.5)
+            delta[i, 0], delta[i, 1] = u - base[i, 0], v - base[i, 1]
+    t = templates(coefficients, side, rotation_rad)
+    refine(t, image, base, delta, gain_and_offset, 1, 0.0, hessians, outcome)
+    return base + delta - centres, hessians, outcome[:, 3].copy()
 
 
 # --------------------------------------------------------- 3. rigid motion (12), (13), (15)
@@ -1043,10 +1053,10 @@ def running_medians(history):  # type: ignore[no-untyped-def]
 
 @_jit
 def frame_statistics(image):  # type: ignore[no-untyped-def]
-    """Mean grey level, and mean squared gradient (grey²/px²), over every 16th row of an image."""
+    """Mean grey level, and mean squared gradient (grey²/px²), over every 32nd row of an image."""
     height, width = image.shape
     total, energy, count = np.int64(0), np.int64(0), 0
-    for y in range(8, height - 1, 16):
+    for y in range(16, height - 1, 32):
         row, below = image[y], image[y + 1]
         line, square = np.int32(0), np.int32(0)
         for x in range(width - 1):
@@ -1058,3 +1068,14 @@ def frame_statistics(image):  # type: ignore[no-untyped-def]
         energy += square
         count += width - 1
     return total / max(count, 1), energy / max(count, 1)
+
+
+@_jit
+def shifts_of(points, u, v, rotation_rad, scale):  # type: ignore[no-untyped-def]
+    """Shift [n, 2] (px) of the content at each of `points` [n, 2] (px from the centre) under a `Motion`."""
+    c, s = scale * np.cos(rotation_rad), scale * np.sin(rotation_rad)
+    shifts = np.empty(points.shape)
+    for i in range(len(points)):
+        pu, pv = points[i]
+        shifts[i, 0], shifts[i, 1] = c * pu - s * pv + u - pu, s * pu + c * pv + v - pv
+    return shifts

@@ -7,7 +7,6 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.correlation.equations import Motion
 from pipelines.correlation.settings import CorrelationSettings
 from pipelines.estimator import EstimatorError
 
@@ -21,7 +20,8 @@ SPAN_U, SPAN_V = 0.43, 0.586
 class Layout(NamedTuple):
     """Pixel centres (u, v) of F fragments and T tiles, and the same from the image centre.
 
-    `centres` int64 [F, 2], `points` float64 [F, 2], `tile_centres` int64 [T, 2], `tile_points` float64 [T, 2].
+    `centres` int64 [F, 2], `points` float64 [F, 2], `tile_centres` int64 [T, 2], `tile_points` float64 [T, 2];
+    `centres_px`, `tile_centres_px` and `size_px` (width, height) are the same as float64, for the Steps.
     Fragments run along the rows from the rear (small u) to the front; the last of two is the front one.
     """
 
@@ -29,6 +29,11 @@ class Layout(NamedTuple):
     points: Floats
     tile_centres: Integers
     tile_points: Floats
+    centres_px: Floats
+    tile_centres_px: Floats
+    size_px: Floats
+    no_tile_shift: Floats
+    no_tile_weight: Floats
 
 
 def layout_of(settings: CorrelationSettings, width: int, height: int) -> Layout:
@@ -61,7 +66,20 @@ def layout_of(settings: CorrelationSettings, width: int, height: int) -> Layout:
         dtype=np.int64,
     ).reshape(-1, 2)
     middle = np.array([(width - 1) / 2, (height - 1) / 2])
-    return Layout(centres, centres - middle, tiles, tiles - middle)
+    layout = Layout(
+        centres,
+        centres - middle,
+        tiles,
+        tiles - middle,
+        centres.astype(np.float64),
+        tiles.astype(np.float64),
+        np.array([width, height], np.float64),
+        np.full(tiles.shape, np.nan),
+        np.zeros(len(tiles)),
+    )
+    for shared in layout:
+        shared.setflags(write=False)
+    return layout
 
 
 def _spread(count: int, span: float) -> list[int]:
@@ -74,8 +92,3 @@ def _between(count: int, size: int, margin: int) -> list[int]:
     if count == 1:
         return [size // 2]
     return [round(margin + (size - 1 - 2 * margin) * i / (count - 1)) for i in range(count)]
-
-
-def shifts_of(motion: Motion, points: Floats) -> Floats:
-    """Shift [n, 2] (px) of the content at each of `points` [n, 2] (px from the image centre)."""
-    return np.array([motion.shift_of(u, v) for u, v in points.tolist()])

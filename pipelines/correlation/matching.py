@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 from pipelines.correlation import kernels
 from pipelines.correlation.equations import Motion
 from pipelines.correlation.judging import alarms_of_fit, alarms_of_match, limits_of, median
-from pipelines.correlation.layout import Layout, layout_of, shifts_of
+from pipelines.correlation.layout import Layout, layout_of
 from pipelines.correlation.settings import CorrelationSettings
 from pipelines.verdict import Verdict
 
@@ -100,13 +100,9 @@ class Matcher:
         """Whether every fragment of the template, after that motion, still lies inside the image."""
         height, width = template.grey.shape
         margin = (self._s.fragment_side_px - 1) / 2
-        layout = self.layout(width, height)
-        low_u, low_v = margin - (width - 1) / 2, margin - (height - 1) / 2
-        for u, v in layout.points.tolist():
-            du, dv = motion.shift_of(u, v)
-            if not (low_u <= u + du <= -low_u and low_v <= v + dv <= -low_v):
-                return False
-        return True
+        points = self.layout(width, height).points
+        moved = np.abs(points + kernels.shifts_of(points, *motion)).max(axis=0)
+        return bool(moved[0] <= (width - 1) / 2 - margin and moved[1] <= (height - 1) / 2 - margin)
 
     def match(
         self,
@@ -131,7 +127,7 @@ class Matcher:
         layout = self.layout(width, height)
         alarms = 0
         if s.prediction == "constant-velocity":
-            expected = shifts_of(predicted, layout.points)
+            expected = kernels.shifts_of(layout.points, *predicted)
         elif s.prediction == "last-shift" and last_shift is not None:
             expected = last_shift
         else:
@@ -181,7 +177,19 @@ class Matcher:
         alarms |= alarms_of_match(*arrays, layout.centres, search, self._limits)
         distance = layout.points[1, 0] - layout.points[0, 0]
         alarms |= alarms_of_fit(self._limits, motion.rotation_rad, motion.scale, distance)
-        return Candidate(template, motion, expected, search, m, 2 * found, *no_tiles(layout), covariance, alarms, found)
+        return Candidate(
+            template,
+            motion,
+            expected,
+            search,
+            m,
+            2 * found,
+            layout.no_tile_shift,
+            layout.no_tile_weight,
+            covariance,
+            alarms,
+            found,
+        )
 
     def _robust_motion(
         self,
@@ -209,7 +217,7 @@ class Matcher:
         alarms |= alarms_of_match(m.surface, m.hessian, m.block, layout.centres, search, self._limits)
         m.weight[:] = 0.0
         candidate = Candidate(
-            template, predicted, expected, search, m, 0, *no_tiles(layout), NO_COVARIANCE,
+            template, predicted, expected, search, m, 0, layout.no_tile_shift, layout.no_tile_weight, NO_COVARIANCE,
             alarms | int(Verdict.TOO_FEW_INLIERS), False,
         )  # fmt: skip
         if found[4] < 2:
@@ -228,7 +236,7 @@ class Matcher:
             and s.accepted_gain[0] <= gain <= s.accepted_gain[1]
             and not residual > s.max_residual_ratio * max(usual_residual, 1.0)
         )
-        final, tile_shift, tile_weight = fit, *no_tiles(layout)
+        final, tile_shift, tile_weight = fit, layout.no_tile_shift, layout.no_tile_weight
         if acceptable and len(layout.tile_centres):
             final, tile_shift, tile_weight = self._whole_frame(template, grey, layout, fit)
         rotation = 0.0 if s.mount == "gimballed" else final.rotation_rad
@@ -252,18 +260,25 @@ class Matcher:
     def _whole_frame(
         self, template: Template, grey: Grey, layout: Layout, fit: kernels.Fit
     ) -> tuple[kernels.Fit, Floats, Floats]:
-        """The photometric step: many tiles refined from the fragments' motion, and one joint fit."""
+        """The photometric step: one joint fit to many tiles, repeated from its own result until it rests."""
         s = self._s
         motion = (fit.shift_u, fit.shift_v, fit.rotation_rad, fit.scale)
-        shift, hessian, rms = kernels.refine_tiles(
-            template.tiles, grey, layout.tile_centres, layout.tile_points, *motion, s.tile_side_px,
-            s.gain_and_offset, s.tile_iterations, s.tolerance_px,
-        )  # fmt: skip
-        whole = kernels.photometric_fit(
-            layout.tile_points, shift, hessian, rms, *motion, s.inlier_px, s.robust_scale_px
-        )
-        better = whole.inliers >= 2 * fit.inliers
-        return (whole if better else fit), shift, (whole.weight if better else np.zeros(len(shift)))
+        for _ in range(s.tile_rounds):
+            shift, hessian, rms = kernels.refine_tiles(
+                template.tiles, grey, layout.tile_centres, layout.tile_points, *motion, s.tile_side_px,
+                s.gain_and_offset,
+            )  # fmt: skip
+            whole = kernels.photometric_fit(
+                layout.tile_points, shift, hessian, rms, *motion, s.inlier_px, s.robust_scale_px
+            )
+            if whole.inliers < 2 * fit.inliers:
+                return fit, layout.no_tile_shift, layout.no_tile_weight
+            before, motion = motion, (whole.shift_u, whole.shift_v, whole.rotation_rad, whole.scale)
+            reach = max(grey.shape) / 2
+            moved = abs(motion[0] - before[0]) + abs(motion[1] - before[1]) + reach * abs(motion[2] - before[2])
+            if moved < s.tile_tolerance_px:
+                break
+        return whole, shift, whole.weight
 
     def search_globally(self, template: Grey, grey: Grey) -> list[Motion]:
         """Motions that a patch of the template's centre proposes over the whole frame, the best first.
@@ -293,11 +308,6 @@ class Matcher:
                 motion = Motion((i - left) * GLOBAL_REDUCTION, (j - top) * GLOBAL_REDUCTION, rotation)
                 found.append((-value, motion))
         return [motion for _, motion in sorted(found)]
-
-
-def no_tiles(layout: Layout) -> tuple[Floats, Floats]:
-    """Shifts [T, 2] and weights [T] of tiles that were not refined."""
-    return np.full(layout.tile_points.shape, np.nan), np.zeros(len(layout.tile_points))
 
 
 def _outside(search: list[list[int]], side: int, radius: int, width: int, height: int) -> list[int]:

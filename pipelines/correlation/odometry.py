@@ -197,7 +197,7 @@ class CorrelationOdometry:
             relative=relative,
             velocity=motion if accepted else state.velocity,
             velocity_s=dt_s if accepted else state.velocity_s,
-            last_shift=_whole(candidate.matches.shift_px),
+            last_shift=candidate.matches.peak_px if accepted else None,
             inliers=candidate.inliers if accepted else state.inliers,
             lost_frames=0 if accepted else state.lost_frames + 1,
             pose=pose,
@@ -412,13 +412,12 @@ class CorrelationOdometry:
         """Everything that was computed for this frame; `state` is the one after it."""
         s = self._settings
         m, motion, flags = candidate.matches, candidate.motion, Verdict(int(alarms))
-        height, width = grey.shape
         if grey.size:
-            layout = self._matcher.layout(width, height)
-            fragments, points, tiles = layout.centres, layout.points, layout.tile_centres
+            layout = self._matcher.layout(grey.shape[1], grey.shape[0])
+            fragments, points, tiles, size = layout.centres_px, layout.points, layout.tile_centres_px, layout.size_px
         else:
             fragments = points = np.full(m.shift_px.shape, np.nan)
-            tiles = np.full(candidate.tile_shift.shape, np.nan)
+            tiles, size = np.full(candidate.tile_shift.shape, np.nan), np.full(2, np.nan)
         x, y, heading = state.pose
         total_x, total_y = state.correction_total
         covariance = state.covariance
@@ -432,14 +431,14 @@ class CorrelationOdometry:
             accepted=candidate.acceptable,
             template_frame=candidate.template.frame,
             dt_s=advance.dt_s,
-            image_size_px=np.array([width, height], np.float64),
+            image_size_px=size,
             mean_grey=state.mean_grey,
             gradient_energy=state.gradient,
             fragment_side_px=s.fragment_side_px,
             search_radius_px=s.search_radius_px,
-            fragment_px=_floats(fragments),
+            fragment_px=fragments,
             predicted_shift_px=candidate.predicted_shift,
-            search_centre_px=_floats(candidate.search),
+            search_centre_px=candidate.search.astype(np.float64),
             surface=m.surface,
             peak_px=m.peak_px,
             peak_correlation=m.peak_correlation,
@@ -467,7 +466,7 @@ class CorrelationOdometry:
             scale=motion.scale,
             centre_shift_px=np.array([motion.u, motion.v]),
             template_rotation_rad=motion.rotation_rad,
-            tile_px=_floats(tiles),
+            tile_px=tiles,
             tile_shift_px=candidate.tile_shift,
             tile_weight=candidate.tile_weight,
             motion_covariance=advance.covariance_px,
@@ -518,12 +517,3 @@ def _same_image(a: Grey, b: Grey) -> bool:
     """Whether two images of one shape are equal pixel by pixel; one row tells most of them apart."""
     row = a.shape[0] // 2
     return np.array_equal(a[row], b[row]) and np.array_equal(a, b)
-
-
-def _whole(shift: Floats) -> Floats:
-    """Shifts rounded to whole pixels, zero where there is none: the centres of the next search."""
-    return np.where(np.isfinite(shift), np.floor(shift + 0.5), 0.0)
-
-
-def _floats(pixels: NDArray[np.int64] | Floats) -> Floats:
-    return pixels.astype(np.float64)

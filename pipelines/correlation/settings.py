@@ -78,7 +78,8 @@ class CorrelationSettings(BaseModel):
     tile_columns: Annotated[int, Field(ge=0, le=32)] = Field(7, description="photometric tiles along u, 0: none")
     tile_rows: Annotated[int, Field(ge=0, le=32)] = Field(6, description="photometric tiles along v, 0: none")
     tile_side_px: Annotated[int, Field(ge=5, le=63)] = Field(21, description="side of a tile, odd")
-    tile_iterations: Annotated[int, Field(ge=1, le=10)] = Field(2, description="refinement steps of a tile")
+    tile_rounds: Annotated[int, Field(ge=1, le=10)] = Field(3, description="most rounds of the photometric step")
+    tile_tolerance_px: Positive = Field(0.03, description="a round that moves the frame less is the last one")
 
     # key frames and recovery
     key_frames: bool = Field(True, description="search the fragments of the oldest frame that still overlaps")

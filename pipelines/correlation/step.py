@@ -31,8 +31,8 @@ class CorrelationStep(Step):
     template_frame: int = quantity("1", "number of the frame whose fragments were searched, -1 for none")
     dt_s: float = quantity("s", "sensor time since the frame before")
     image_size_px: Floats = quantity("px", "width and height of the image", 2)
-    mean_grey: float = quantity("grey", "mean grey level over every 16th row of the image")
-    gradient_energy: float = quantity("grey²/px²", "mean squared gradient over every 16th row")
+    mean_grey: float = quantity("grey", "mean grey level over every 32nd row of the image")
+    gradient_energy: float = quantity("grey²/px²", "mean squared gradient over every 32nd row")
 
     # 1. integer shift, extremal correlation (2), (3)
     fragment_side_px: int = quantity("px", "side N of a fragment")
