@@ -37,6 +37,7 @@ UE4_FROM_ENU = array([1, 0, 0], [0, -1, 0], [0, 0, 1])
 
 _EUROC_MODELS = {"radial-tangential": "plumb_bob", "radtan": "plumb_bob", "equidistant": "equidistant"}
 _NAN3, _NAN34 = array(*[[math.nan] * 3] * 3), array(*[[math.nan] * 4] * 3)
+HEADER_LINES = 20
 _TUM_COLUMNS = [1, 2, 3, 4, 5, 6, 7]
 
 
@@ -98,7 +99,7 @@ def _euroc_camera(draft: Draft, sensor: Path) -> None:
     draft.cameras[sensor.name] = camera
     transform = _matrix4(settings.get("T_BS"))
     if transform is not None:
-        draft.note(f"{sensor.name}: body_T_cam (T_BS) is {np.array2string(transform, separator=', ', precision=12)}")
+        draft.note(f"{sensor.name}: body_T_cam (T_BS) is {transform.tolist()}")
     _check_size(draft, sensor.name, camera, files)
 
 
@@ -277,13 +278,12 @@ def _kitti_cameras(draft: Draft, path: Path, folders: dict[str, list[Path]]) -> 
         return
     table, projections = read_table(path), {}
     labelled = any(cells[0].endswith(":") for _, cells in table.rows)
-    for row, (line, cells) in enumerate(_with_header(table)):
+    for row, (line, cells) in enumerate(table.rows):
         label = cells[0].rstrip(":") if labelled else f"P{row}"
         if not re.fullmatch(r"P\d", label):
             continue
         try:
-            numbers = [table.number(cell) for cell in cells[labelled:]]
-            projections[label[1:]] = np.array(numbers, float).reshape(3, 4)
+            projections[label[1:]] = _matrix34([table.number(cell) for cell in cells[labelled:]])
         except ValueError as error:
             table.bad.append((line, str(error)))
     draft.bad_rows(table)
@@ -295,10 +295,6 @@ def _kitti_cameras(draft: Draft, path: Path, folders: dict[str, list[Path]]) -> 
             draft.cameras[name] = _rectified(projection, width, height)
         else:
             draft.note(f"{name}: calib.txt has no P{name[-1]}, no intrinsics")
-
-
-def _with_header(table: Table) -> list[tuple[int, list[str]]]:
-    return table.rows
 
 
 def _rectified(projection: FloatArray, width: int, height: int) -> Camera:
@@ -342,10 +338,14 @@ def _kitti_poses(draft: Draft, times: dict[int, int], images: int) -> None:
     draft.note("poses: camera axes (z forward, x right, y down) were turned to x forward, y left, z up")
 
 
-def _kitti_pose(numbers: list[float]) -> FloatArray:
+def _matrix34(numbers: list[float]) -> FloatArray:
     if len(numbers) != 12:
         raise ValueError(f"{len(numbers)} numbers instead of 12")
-    pose = np.array(numbers).reshape(3, 4)
+    return np.array(numbers).reshape(3, 4)
+
+
+def _kitti_pose(numbers: list[float]) -> FloatArray:
+    pose = _matrix34(numbers)
     if np.abs(pose[:, :3] @ pose[:, :3].T - np.eye(3)).max() > 1e-3 or np.linalg.det(pose[:, :3]) < 0:
         raise ValueError("the first three columns are no rotation")
     return pose
@@ -374,10 +374,9 @@ def surface_set(root: Path, options: ReadOptions) -> Draft | None:
     if not (files := images_in(root)):
         return None
     for path in _tables(root):
-        table = read_table(path)
-        columns = _surface_columns(table)
+        columns = _surface_columns(read_table(path, lines_read=HEADER_LINES))
         if columns is not None:
-            return _surface_draft(root, files, table, columns)
+            return _surface_draft(root, files, read_table(path), columns)
     return None
 
 
@@ -454,12 +453,12 @@ def mocap_table(root: Path, options: ReadOptions) -> Draft | None:
     The time of an image is that of the first row that carries its number. Poses come out as stored.
     """
     for path in _tables(root):
-        table = read_table(path)
+        table = read_table(path, lines_read=HEADER_LINES)
         position = table.columns("x", "y", "z")
         rotation = table.columns("qx", "qy", "qz")
         time, frame = table.column("time", "t_"), table.column("frame", "image")
         if time is not None and frame is not None and position and rotation:
-            return _mocap_draft(root, table, time, frame, position + rotation)
+            return _mocap_draft(root, read_table(path), time, frame, position + rotation)
     return None
 
 
@@ -467,8 +466,8 @@ def _mocap_draft(root: Path, table: Table, time: int, frame: int, columns: list[
     qw = table.column("qw")
     stamps, values = table.timed(time, unit_of_time(table, "s", time), [frame, *columns, *([] if qw is None else [qw])])
     first_seen: dict[int, int] = {}
-    for t_ns, number in zip(stamps.tolist(), values[:, 0].astype(int).tolist(), strict=True):
-        first_seen.setdefault(number, t_ns)
+    for t_ns, number in zip(stamps.tolist(), values[:, 0].tolist(), strict=True):
+        first_seen.setdefault(int(number), t_ns)
     folder = _best_folder(root, lambda file: frame_number(file) in first_seen)
     if folder is None:
         return None
@@ -503,16 +502,18 @@ def _with_qw(draft: Draft, vector: FloatArray) -> FloatArray:
 def gnss_table(root: Path, options: ReadOptions) -> Draft | None:
     """Photos beside a table of file, time, latitude and longitude in degrees, altitude in m."""
     for path in _tables(root):
-        table = read_table(path)
+        table = read_table(path, lines_read=HEADER_LINES)
         name, time = table.column("file", "image", "name"), table.column("exif_time", "time", "date")
         place = table.columns("lat", "lon", "alt")
         if name is not None and time is not None and place:
-            return _gnss_draft(root, table, name, time, place)
+            return _gnss_draft(root, read_table(path), name, time, place)
     return None
 
 
 def _gnss_draft(root: Path, table: Table, name: int, time: int, place: list[int]) -> Draft | None:
-    listed = {cells[name] for _, cells in table.rows if name < len(cells)}
+    table.bad += [(line, "too few columns") for line, cells in table.rows if len(cells) <= name]
+    table.rows = [(line, cells) for line, cells in table.rows if len(cells) > name]
+    listed = {cells[name] for _, cells in table.rows}
     folder = _best_folder(root, lambda file: file.name in listed)
     if folder is None:
         return None
@@ -534,7 +535,8 @@ def _gnss_draft(root: Path, table: Table, name: int, time: int, place: list[int]
 
 
 def _note_left_out(draft: Draft, files: Sequence[Path], timed: Sequence[Path], table: str) -> None:
-    left = [file.name for file in files if file not in set(timed)]
+    used = set(timed)
+    left = [file.name for file in files if file not in used]
     if left:
         draft.note(f"{len(left)} images without a row in {table} are left out ({shortened(left)})")
 

@@ -33,7 +33,6 @@ from readers.streams import (
     StreamError,
     StreamInfo,
     StreamKind,
-    array,
 )
 
 Times = NDArray[np.int64]
@@ -76,14 +75,17 @@ class FolderRecording(Recording):
 
     @property
     def streams(self) -> tuple[StreamInfo, ...]:
+        """See `Recording.streams`."""
         return tuple(stream.info for stream in self._streams.values())
 
     @property
     def cameras(self) -> dict[str, Camera]:
+        """See `Recording.cameras`."""
         return dict(self._cameras)
 
     @property
     def damage(self) -> tuple[Damage, ...]:
+        """Rows and files that could not be used when the folder was opened."""
         return self._damage
 
     def read(
@@ -122,7 +124,7 @@ class Draft:
 
     def bad_rows(self, table: Table) -> None:
         """Take over what a table could not read."""
-        self.damage += table.damage(self.path)
+        self.damage += [damage for damage in table.damage(self.path) if damage not in self.damage]
 
     def images(self, name: str, files: Sequence[Path], times_ns: Sequence[int] | Times, kind: str) -> None:
         """Add an image stream: one file per time."""
@@ -151,8 +153,8 @@ class Draft:
         odd = int(np.sum((np.abs(norm - 1) > NORM_TOLERANCE) & (norm > 0)))
         if odd:
             self.note(f"{name}: {odd} quaternions are off unit norm by more than 1 % and were normalised")
-        quats = np.divide(quat_xyzw, norm, out=np.zeros_like(quat_xyzw), where=norm > 0)[order]
-        positions = position_m[order]
+        unit = np.divide(quat_xyzw, norm, out=np.array(quat_xyzw), where=norm > 0)
+        positions, quats = _frozen(position_m[order]), _frozen(unit[order])
 
         def make(index: int) -> Sample:
             t_ns = int(times[index])
@@ -160,8 +162,8 @@ class Draft:
                 stream=name,
                 t_ns=t_ns,
                 received_ns=t_ns,
-                position_m=array(*positions[index]),
-                quat_xyzw=array(*quats[index]),
+                position_m=positions[index],
+                quat_xyzw=quats[index],
                 covariance=UNKNOWN_COV6,
                 parent_frame=parent,
                 child_frame=child,
@@ -172,7 +174,7 @@ class Draft:
     def imu(self, name: str, times_ns: Times, values: FloatArray, kind: str) -> None:
         """Add inertial measurements: angular velocity and specific force, values [n, 6] in rad/s and m/s²."""
         order, times = self._ordered(name, times_ns)
-        rows = values[order]
+        rows = _frozen(values[order])
 
         def make(index: int) -> Sample:
             t_ns = int(times[index])
@@ -180,8 +182,8 @@ class Draft:
                 stream=name,
                 t_ns=t_ns,
                 received_ns=t_ns,
-                angular_velocity_radps=array(*rows[index, :3]),
-                linear_acceleration_mps2=array(*rows[index, 3:]),
+                angular_velocity_radps=rows[index, :3],
+                linear_acceleration_mps2=rows[index, 3:],
                 quat_xyzw=UNKNOWN_QUAT,
             )
 
@@ -300,6 +302,11 @@ def file_header(file: Path) -> tuple[str, int, int]:
     if not header[0]:
         raise ValueError("the file does not begin like an image")
     return header
+
+
+def _frozen(values: FloatArray) -> FloatArray:
+    values.setflags(write=False)
+    return values
 
 
 def _load(file: Path, stream: str) -> bytes:

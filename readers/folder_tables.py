@@ -8,6 +8,7 @@ import re
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal, InvalidOperation
+from itertools import islice, pairwise
 from pathlib import Path
 
 import numpy as np
@@ -96,8 +97,8 @@ class Table:
         return listed
 
 
-def read_table(path: Path) -> Table:
-    """Read a text table; its delimiter is found from its first line.
+def read_table(path: Path, *, lines_read: int | None = None) -> Table:
+    """Read a text table (its first `lines_read` lines); its delimiter is found from its first row.
 
     Lines that begin with ``#`` or ``%`` are comments; the last one before the rows, or a first line
     without any number, names the columns.
@@ -107,7 +108,7 @@ def read_table(path: Path) -> Table:
     """
     try:
         with path.open(encoding="utf-8-sig", errors="replace") as file:
-            lines = [(number, line.strip()) for number, line in enumerate(file, 1)]
+            lines = [(number, line.strip()) for number, line in enumerate(islice(file, lines_read), 1)]
     except OSError as error:
         problem = f"cannot be read ({error.strerror})"
         raise RecordingError(path, problem, "check that it is there and may be read") from None
@@ -154,7 +155,7 @@ def guess_unit(texts: list[str]) -> str:
     """
     try:
         values = [Decimal(text) for text in texts if not _ISO.fullmatch(text)]
-        steps = sorted(abs(b - a) for a, b in zip(values, values[1:], strict=False) if a != b)
+        steps = sorted(abs(b - a) for a, b in pairwise(values) if a != b)
         step = steps[len(steps) // 2] if steps else Decimal(0)
         for unit, scale in NS_PER_UNIT.items():
             size = NS_PER_UNIT["s"] // scale

@@ -7,6 +7,7 @@ import re
 from collections.abc import Sequence
 from dataclasses import dataclass
 from fractions import Fraction
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -75,19 +76,34 @@ def _families(files: Sequence[Path]) -> dict[str, list[Path]]:
     for file in files:
         match = _FAMILY.fullmatch(file.stem)
         families.setdefault(match[1] if match else "", []).append(file)
-    numbers = [{frame_number(file) for file in family} for family in families.values()]
-    shared, largest = set.intersection(*numbers), max(len(n) for n in numbers)
-    paired = len(families) > 1 and "" not in families and len(shared) >= max(2, largest / 2)
+    numbers = [_numbers(family) for family in families.values()]
+    paired = len(families) > 1 and all(len(n) > 1 for n in numbers) and _paired_numbers(numbers)
     return families if paired else {"images": list(files)}
 
 
 def ranks_of(groups: dict[str, list[Path]]) -> dict[Path, int]:
-    """Index in time of every frame: frames of several streams with the same number have the same one."""
-    if len(groups) == 1 or any(frame_number(f) is None for files in groups.values() for f in files):
+    """Index in time of every frame, empty if the streams have no order in common.
+
+    Frames of several streams with the same number have the same index.
+    """
+    if len(groups) == 1:
         return {file: rank for files in groups.values() for rank, file in enumerate(files)}
-    numbers = sorted({frame_number(file) or 0 for files in groups.values() for file in files})
-    rank_of = {number: rank for rank, number in enumerate(numbers)}
+    numbers = [_numbers(files) for files in groups.values()]
+    if not _paired_numbers(numbers):
+        return {}
+    rank_of = {number: rank for rank, number in enumerate(sorted(set.union(*numbers)))}
     return {file: rank_of[frame_number(file) or 0] for files in groups.values() for file in files}
+
+
+def _numbers(files: Sequence[Path]) -> set[int]:
+    """The numbers in the files' names, empty if not every file has its own."""
+    numbers = {number for file in files if (number := frame_number(file)) is not None}
+    return numbers if len(numbers) == len(files) else set()
+
+
+def _paired_numbers(numbers: Sequence[set[int]]) -> bool:
+    """Whether most of the numbers are found in every stream."""
+    return len(set.intersection(*numbers)) >= max(1, max(len(n) for n in numbers) / 2)
 
 
 def frame_times(
@@ -111,6 +127,8 @@ def frame_times(
     Raises:
         RecordingError: nothing tells the times.
     """
+    if options.times_unit not in ("auto", *NS_PER_UNIT):
+        raise RecordingError(draft.path, f"unknown unit of times {options.times_unit!r}", "give s, ms, us, ns or auto")
     if options.times_file is not None:
         draft.used_times_file = True
         return _from_table(draft, name, files, ranks, options.times_file, options.times_unit)
@@ -118,6 +136,8 @@ def frame_times(
         return _from_table(draft, name, files, ranks, table, options.times_unit)
     named = _from_names(draft, name, files, options.times_unit)
     times = named or _from_exif(draft, name, files) or _from_rate(draft, name, files, ranks, options)
+    if times is None and not ranks:
+        raise _unrelated(draft.path)
     if times is None:
         raise RecordingError(
             draft.path,
@@ -128,16 +148,29 @@ def frame_times(
     return times
 
 
+def _unrelated(root: Path) -> RecordingError:
+    return RecordingError(
+        root,
+        f"its folders of images ({shortened(list(image_folders(root)))}) have no frame numbers in common",
+        "give one of them",
+    )
+
+
 def rate_times(count: int, rate_hz: float) -> list[int]:
-    """Times of frames at an even rate from 0, rounded to ns; 29.97 and the like stand for their exact fraction.
+    """Times of frames at an even rate from 0, rounded to ns.
 
     Raises:
         ValueError: the rate is not a positive number.
     """
     if not (math.isfinite(rate_hz) and rate_hz > 0):
         raise ValueError(f"a frame rate of {rate_hz} Hz")
-    period = NS_PER_UNIT["s"] / Fraction(rate_hz).limit_denominator(100_000)
+    period = frame_period_ns(rate_hz)
     return [round(index * period) for index in range(count)]
+
+
+def frame_period_ns(rate_hz: float) -> Fraction:
+    """Exact time between frames; a rate such as 29.97002997 stands for its fraction 30000/1001."""
+    return NS_PER_UNIT["s"] / Fraction(rate_hz).limit_denominator(100_000)
 
 
 def exif_of(file: Path) -> Exif | None:
@@ -215,8 +248,8 @@ def _from_table(
         rows = _paired(table, files, ranks)
         draft.note(f"{how}, row by row")
     else:
-        names = {cells[by_name].rsplit("/", 1)[-1]: (line, cells) for line, cells in table.rows if by_name < len(cells)}
-        rows = {f: row for f in files if (row := names.get(f.name) or names.get(f.stem))}
+        named = {_key(cells[by_name]): (line, cells) for line, cells in table.rows if by_name < len(cells)}
+        rows = {f: named[key] for f in files for key in _keys(f) if key in named}
         draft.note(f"{how}, by file name" + _missing(files, rows))
     times = {}
     for file, (line, cells) in rows.items():
@@ -236,10 +269,9 @@ def _paired(table: Table, files: Sequence[Path], ranks: dict[Path, int]) -> dict
     Raises:
         RecordingError: there are more or fewer rows than frames.
     """
-    moments = max(ranks.values()) + 1
     if len(table.rows) == len(files):
         return dict(zip(files, table.rows, strict=True))
-    if len(table.rows) == moments:
+    if len(table.rows) == max(ranks.values(), default=-1) + 1:
         return {file: table.rows[ranks[file]] for file in files}
     problem = f"has {len(table.rows)} rows for {len(files)} frames, and none of its columns names the files"
     raise RecordingError(table.path, problem, "give one time for each frame, or rows of file name and time")
@@ -247,13 +279,25 @@ def _paired(table: Table, files: Sequence[Path], ranks: dict[Path, int]) -> dict
 
 def _name_column(table: Table, files: Sequence[Path]) -> int | None:
     """The column that names the frames, None if there is none."""
-    known = {file.name for file in files} | {f.stem for f in files if not f.stem.isdecimal()}
     widest = max((len(cells) for _, cells in table.rows), default=0)
-    for column in range(widest):
-        cells = [cells[column].rsplit("/", 1)[-1] for _, cells in table.rows if column < len(cells)]
-        if 2 * sum(cell in known for cell in cells) > min(len(cells), len(files)):
-            return column
+    if widest < 2:
+        return None
+    kinds = list(zip(*(_keys(file) for file in files), strict=True))
+    for known in (set(kind) for kind in kinds):
+        for column in range(widest):
+            keys = [_key(cells[column]) for _, cells in table.rows if column < len(cells)]
+            if 2 * sum(key in known for key in keys) > min(len(keys), len(files)):
+                return column
     return None
+
+
+def _keys(file: Path) -> tuple[str | int | None, ...]:
+    """What a table may call a frame, the surest first: its name, the name without suffix, its number."""
+    return file.name, None if file.stem.isdecimal() else file.stem, frame_number(file)
+
+
+def _key(cell: str) -> str | int:
+    return int(cell) if cell.isdecimal() else cell.rsplit("/", 1)[-1]
 
 
 def _time_column(table: Table, name_column: int | None) -> int:
@@ -270,7 +314,7 @@ def _time_column(table: Table, name_column: int | None) -> int:
 
 
 def _running(numbers: list[int]) -> bool:
-    return numbers[0] in (0, 1) and all(b == a + 1 for a, b in zip(numbers, numbers[1:], strict=False))
+    return all(b == a + 1 for a, b in pairwise(numbers))
 
 
 def _table_unit(table: Table, column: int) -> str:
@@ -292,7 +336,8 @@ def _missing(files: Sequence[Path], rows: dict[Path, tuple[int, list[str]]]) -> 
 def shortened(names: Sequence[str], limit: int = 12) -> str:
     """Up to `limit` names, and how many more there are."""
     rest = len(names) - limit
-    return ", ".join(names[:limit]) + (f" and {rest} more" if rest > 0 else "")
+    shown = [name if name.isprintable() else ascii(name) for name in names[:limit]]
+    return ", ".join(shown) + (f" and {rest} more" if rest > 0 else "")
 
 
 def _from_names(draft: Draft, name: str, files: Sequence[Path], unit: str) -> dict[Path, int] | None:
@@ -341,6 +386,8 @@ def _from_rate(
 ) -> dict[Path, int] | None:
     if options.rate_hz is None:
         return None
+    if not ranks:
+        raise _unrelated(draft.path)
     try:
         times = rate_times(max(ranks.values()) + 1, options.rate_hz)
     except ValueError as error:
