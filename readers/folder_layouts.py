@@ -81,7 +81,7 @@ def euroc(root: Path, options: ReadOptions) -> Draft | None:
         else:
             draft.note(f"{sensor.name}/data.csv is of no known kind and is left out")
     for file in sorted(root.glob("*groundtruth*.txt")):
-        _tum_poses(draft, file, file.stem, child="body")
+        _tum_poses(draft, file, draft.free_name(file.stem), child="body")
     return draft
 
 
@@ -401,6 +401,8 @@ def _surface_draft(root: Path, files: list[Path], table: Table, columns: list[in
     time_of = dict(zip([row for line, row in rows.items() if line not in bad], times.tolist(), strict=True))
     numbers = _surface_numbers(draft, files, total, table.path.name)
     timed = [file for file in files if numbers[file] in time_of]
+    if not timed:
+        raise _no_times(table)
     if len(timed) < len(files):
         left = [file.name for file in files if numbers[file] not in time_of]
         draft.note(f"{len(left)} images without a row are left out ({shortened(left)})")
@@ -525,6 +527,8 @@ def _gnss_draft(root: Path, table: Table, name: int, time: int, place: list[int]
     time_of = dict(zip(names, stamps.tolist(), strict=True))
     files = images_in(folder)
     timed = [file for file in files if file.name in time_of]
+    if not timed:
+        raise _no_times(table)
     draft.note(f"images: times from {table.path.name} (taken as UTC where they state no zone)")
     _note_left_out(draft, files, timed, table.path.name)
     draft.images("images", timed, [time_of[file.name] for file in timed], _kind_of(timed))
@@ -532,6 +536,11 @@ def _gnss_draft(root: Path, table: Table, name: int, time: int, place: list[int]
     _note_missing(draft, folder, [n for n in names if n not in {f.name for f in files}])
     _note_other_folders(draft, folder)
     return draft
+
+
+def _no_times(table: Table) -> RecordingError:
+    why = f": line {table.bad[0][0]}: {table.bad[0][1]}" if table.bad else ""
+    return RecordingError(table.path, f"gives no image a time{why}", "mend the table, or move it away and give a rate")
 
 
 def _note_left_out(draft: Draft, files: Sequence[Path], timed: Sequence[Path], table: str) -> None:
@@ -588,7 +597,7 @@ def _plain_poses(draft: Draft, path: Path, moment_of: dict[int, int]) -> None:
     table = read_table(path)
     widths = {len(cells) for _, cells in table.rows}
     if widths == {8}:
-        _tum_poses(draft, path, path.stem, child="camera_optical")
+        _tum_poses(draft, path, draft.free_name(path.stem), child="camera_optical")
     elif widths == {7}:
         _poses_by_frame(draft, table, moment_of)
     else:
@@ -596,7 +605,7 @@ def _plain_poses(draft: Draft, path: Path, moment_of: dict[int, int]) -> None:
 
 
 def _poses_by_frame(draft: Draft, table: Table, moment_of: dict[int, int]) -> None:
-    stem, stamps, poses = table.path.stem, [], []
+    stream, stamps, poses = draft.free_name(table.path.stem), [], []
     for row, (line, cells) in enumerate(table.rows):
         try:
             pose = [table.number(cell) for cell in cells]
@@ -608,7 +617,7 @@ def _poses_by_frame(draft: Draft, table: Table, moment_of: dict[int, int]) -> No
             poses.append(pose)
     draft.bad_rows(table)
     values = np.array(poses, float).reshape(len(poses), 7)
-    draft.poses(stem, stamps, values[:, :3], values[:, 3:], "pose of each frame", child="camera_optical")
+    draft.poses(stream, stamps, values[:, :3], values[:, 3:], "pose of each frame", child="camera_optical")
     draft.note(f"{table.path.name} has no times: row k is the pose of frame k, taken as x y z qx qy qz qw")
     if len(table.rows) != len(moment_of):
         draft.note(f"{table.path.name} has {len(table.rows)} poses for {len(moment_of)} frames")

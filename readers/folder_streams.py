@@ -240,6 +240,12 @@ class Draft:
 
         self._add(name, StreamKind.SCALAR, kind, times, make)
 
+    def free_name(self, name: str) -> str:
+        """That name, with underscores behind it if a stream has it already."""
+        while any(stream.info.name == name for stream in self.streams):
+            name += "_"
+        return name
+
     def _ordered(self, name: str, times_ns: Sequence[int] | Times) -> tuple[NDArray[np.intp], Times]:
         """The order by time (stable) and the times in it; disorder is noted."""
         times = np.asarray(times_ns, np.int64)

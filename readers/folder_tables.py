@@ -56,7 +56,10 @@ class Table:
         Raises:
             ValueError: it is none.
         """
-        value = float(cell.replace(",", ".") if self.decimal_comma else cell)
+        try:
+            value = float(self.plain(cell))
+        except ValueError:
+            raise ValueError(f"{cell!r} is not a number") from None
         if not math.isfinite(value):
             raise ValueError(f"{cell!r} is not finite")
         return value

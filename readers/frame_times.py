@@ -34,8 +34,9 @@ class Exif:
 
 def natural_key(path: Path) -> list[tuple[int, int, str]]:
     """Sort key that reads digits as numbers: frame2 before frame10."""
-    parts = re.findall(r"\d+|\D+", path.name)
-    return [(0, int(part), part) if part[0] in "0123456789" else (1, 0, part) for part in parts]
+    parts = re.findall(r"[0-9]+|[^0-9]+", path.name)
+    key = [(0, int(part), "") if part[0] in "0123456789" else (1, 0, part) for part in parts]
+    return [*key, (2, 0, path.name)]
 
 
 def frame_number(path: Path) -> int | None:
@@ -77,7 +78,8 @@ def _families(files: Sequence[Path]) -> dict[str, list[Path]]:
         match = _FAMILY.fullmatch(file.stem)
         families.setdefault(match[1] if match else "", []).append(file)
     numbers = [_numbers(family) for family in families.values()]
-    paired = len(families) > 1 and all(len(n) > 1 for n in numbers) and _paired_numbers(numbers)
+    named = len(families) > 1 and "" not in families and all(len(n) > 1 for n in numbers)
+    paired = named and _paired_numbers(numbers)
     return families if paired else {"images": list(files)}
 
 
@@ -282,13 +284,14 @@ def _name_column(table: Table, files: Sequence[Path]) -> int | None:
     widest = max((len(cells) for _, cells in table.rows), default=0)
     if widest < 2:
         return None
-    kinds = list(zip(*(_keys(file) for file in files), strict=True))
-    for known in (set(kind) for kind in kinds):
-        for column in range(widest):
-            keys = [_key(cells[column]) for _, cells in table.rows if column < len(cells)]
-            if 2 * sum(key in known for key in keys) > min(len(keys), len(files)):
+    columns = [{_key(cells[c]) for _, cells in table.rows if c < len(cells)} for c in range(widest)]
+    names, stems, numbers = (set(kind) for kind in zip(*(_keys(file) for file in files), strict=True))
+    for known in (names, stems):
+        for column, keys in enumerate(columns):
+            if 2 * len(keys & known) > min(len(keys), len(files)):
                 return column
-    return None
+    # Numbers must all be there: a count of rows from 0 also meets most of the names that count from 1.
+    return next((column for column, keys in enumerate(columns) if numbers <= keys), None)
 
 
 def _keys(file: Path) -> tuple[str | int | None, ...]:
@@ -376,8 +379,7 @@ def _from_exif(draft: Draft, name: str, files: Sequence[Path]) -> dict[Path, int
     fixes = [photo for photo in photos.values() if not math.isnan(photo.position[0])]
     if fixes:
         values: FloatArray = np.array([photo.position for photo in fixes])
-        stream = "gps" if not any(s.info.name == "gps" for s in draft.streams) else f"{name}/gps"
-        draft.gnss(stream, [photo.t_ns for photo in fixes], values, "EXIF position")
+        draft.gnss(draft.free_name("gps"), [photo.t_ns for photo in fixes], values, "EXIF position")
     return times
 
 
