@@ -7,7 +7,7 @@ import math
 import re
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
-from decimal import Decimal, InvalidOperation
+from decimal import Decimal
 from itertools import islice, pairwise
 from pathlib import Path
 
@@ -139,12 +139,13 @@ def exact_ns(text: str, unit: str) -> int:
     if match := _ISO.fullmatch(text):
         return _calendar_ns(match)
     try:
-        t_ns = int((Decimal(text) * NS_PER_UNIT[unit]).to_integral_value())
-    except (InvalidOperation, OverflowError, ValueError):
+        value = (Decimal(text) * NS_PER_UNIT[unit]).to_integral_value()
+        in_range = 0 <= value < 2**63
+    except ArithmeticError:
         raise ValueError(f"{text!r} is not a time") from None
-    if not 0 <= t_ns < 2**63:
+    if not in_range:
         raise ValueError(f"{text!r} is not a time from 0 to 2^63 ns")
-    return t_ns
+    return int(value)
 
 
 def guess_unit(texts: list[str]) -> str:
@@ -165,7 +166,7 @@ def guess_unit(texts: list[str]) -> str:
             of_epoch = all(EPOCH_S[0] * size <= value < EPOCH_S[1] * size for value in values)
             if values and of_epoch and step * scale <= SLOW_STEP_NS:
                 return unit
-    except InvalidOperation:
+    except ArithmeticError:
         raise ValueError("a time is not a number") from None
     for unit, limit in (("s", Decimal(5)), ("ms", Decimal(5_000)), ("us", Decimal(5_000_000))):
         if step < limit:
@@ -196,8 +197,8 @@ def _calendar_ns(match: re.Match[str]) -> int:
     moment = datetime(year, month, day, hour, minute, second, tzinfo=UTC)
     seconds = int(moment.timestamp()) - _zone_s(match[8] or "Z")
     t_ns = seconds * NS_PER_UNIT["s"] + int(Decimal(f"0{match[7] or '.0'}") * NS_PER_UNIT["s"])
-    if t_ns < 0:
-        raise ValueError(f"{match[0]!r} lies before 1970")
+    if not 0 <= t_ns < 2**63:
+        raise ValueError(f"{match[0]!r} lies before 1970 or after 2262")
     return t_ns
 
 
