@@ -20,6 +20,7 @@ NS_PER_UNIT = {"s": 1_000_000_000, "ms": 1_000_000, "us": 1_000, "ns": 1}
 EPOCH_S = (Decimal(900_000_000), Decimal(4_200_000_000))  # years 1998 to 2103
 SLOW_STEP_NS = 3600 * NS_PER_UNIT["s"]
 LISTED_ROWS = 10
+LARGEST = 1e100  # no measurement is larger, and squares of larger numbers overflow
 _ISO = re.compile(r"(\d{4})[-:](\d\d)[-:](\d\d)[ T](\d\d):(\d\d):(\d\d)(\.\d+)?(Z|[+-]\d\d:?\d\d)?")
 
 
@@ -60,7 +61,7 @@ class Table:
             value = float(self.plain(cell))
         except ValueError:
             raise ValueError(f"{cell!r} is not a number") from None
-        if not math.isfinite(value):
+        if not abs(value) < LARGEST:
             raise ValueError(f"{cell!r} is not finite")
         return value
 

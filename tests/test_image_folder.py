@@ -155,10 +155,10 @@ def test_tables_of_every_kind(tmp_path: Path) -> None:
     assert semicolon.header == ["time [s]", "x"]
     stamps, values = semicolon.timed(0, "s", [1])
     assert (stamps.tolist(), values.tolist()) == ([1_500_000_000], [[2.25]])
-    blank = read_table(write(tmp_path / "b.txt", "# first\n# time x\n\n1 2\nnan 3\n4\n5 inf\n6 7"))
+    blank = read_table(write(tmp_path / "b.txt", "# first\n# time x\n\n1 2\nnan 3\n4\n5 inf\n6 7\n8 1e200"))
     assert blank.header == ["time", "x"]
     assert blank.timed(0, "s", [1])[0].tolist() == [SECOND, 6 * SECOND]
-    assert [line for line, _ in blank.bad] == [5, 6, 7]
+    assert [line for line, _ in blank.bad] == [5, 6, 7, 9]
     quoted = read_table(write(tmp_path / "c.csv", 'file,time\n"a, b.png",3\n'))
     assert quoted.rows == [(2, ["a, b.png", "3"])]
     empty = read_table(write(tmp_path / "d.csv", ""))
