@@ -14,8 +14,14 @@ from types import SimpleNamespace
 from typing import Any
 
 import zstandard
-from google.protobuf import descriptor_pb2, descriptor_pool, duration_pb2, message_factory, timestamp_pb2
-from google.protobuf.message import DecodeError
+from google.protobuf import (  # type: ignore[import-untyped, unused-ignore]
+    descriptor_pb2,
+    descriptor_pool,
+    duration_pb2,
+    message_factory,
+    timestamp_pb2,
+)
+from google.protobuf.message import DecodeError  # type: ignore[import-untyped, unused-ignore]
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 

@@ -19,7 +19,7 @@ from mcap.data_stream import ReadDataStream
 from mcap.exceptions import McapError
 from mcap.opcode import Opcode
 
-from readers.message_log import Block, BlockDamaged, BlockLog, Channel, Message, inflate, text
+from readers.message_log import Block, BlockLog, Channel, DamagedBlockError, Message, inflate, text
 from readers.streams import RecordingError
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -70,7 +70,8 @@ class McapLog(BlockLog):
             if fault is not None:
                 self._forget()
                 self._scan(fault)
-            self._find_edges()
+            else:
+                self._find_edges()
         except BaseException:
             self.close()
             raise
@@ -130,7 +131,7 @@ class McapLog(BlockLog):
                 indexes.append(_record(records.ChunkIndex, body))
             else:
                 self._describe(opcode, body)
-        if statistics is None or statistics.message_count and not indexes:
+        if statistics is None or (statistics.message_count and not indexes):
             return False
         for index in indexes:
             if not index.message_index_offsets or not set(index.message_index_offsets) <= set(self._by_id):
@@ -208,15 +209,15 @@ class McapLog(BlockLog):
         if opcode != Opcode.CHUNK:
             return "the file ends inside a record" if opcode else "no record begins where one should"
         found = self._take(offset, self._size - offset, torn=True)
-        return f"the file ends inside a chunk, {found} messages of which are read without a checksum"
+        return f"the file ends inside a chunk, {found} messages of which are read without a checksum; the chunk begins"
 
     def _report_end(self, offset: int, closed: bool, fault: str, problem: str) -> None:
         if problem:
             self._report(problem, offset, self._size - offset)
         elif closed and fault:
-            self._report(f"{fault}; all messages lie before that and are read", offset, 0)
+            self._report(f"{fault}, though every message can be read; the damage begins", offset, 0)
         elif not closed:
-            self._report("the file was not closed and ends between two records; what is there is read", offset, 0)
+            self._report("the file was not closed, what is there can be read; it breaks off", offset, 0)
 
     def _take(self, offset: int, size: int, *, torn: bool = False) -> int:
         """Read one block, count what it holds, keep where it lies; the number of its messages."""
@@ -241,13 +242,13 @@ class McapLog(BlockLog):
             compression = text(body[_CHUNK.size : _CHUNK.size + name_length])
             (length,) = struct.unpack_from("<Q", body, _CHUNK.size + name_length)
         except struct.error as error:
-            raise BlockDamaged("a chunk ends within its header") from error
+            raise DamagedBlockError("a chunk ends within its header") from error
         packed = body[_CHUNK.size + name_length + 8 :][:length]
         if len(packed) < length and not torn:
-            raise BlockDamaged(f"a chunk states {length} bytes and {len(packed)} are there")
+            raise DamagedBlockError(f"a chunk states {length} bytes and {len(packed)} are there")
         data = memoryview(inflate(compression, packed, size, torn=torn))
         if crc and not torn and zlib.crc32(data) != crc:
-            raise BlockDamaged("a chunk does not match its checksum and is left out")
+            raise DamagedBlockError("a chunk does not match its checksum and is left out")
         return self._messages(data, torn)
 
     def _messages(self, data: memoryview, torn: bool) -> tuple[list[Message], str]:
@@ -256,7 +257,9 @@ class McapLog(BlockLog):
         for opcode, body in _split(data):
             if body is None:
                 return found, "" if torn else "the records of a chunk break off"
-            if opcode == Opcode.MESSAGE and len(body) >= _MESSAGE.size:
+            if opcode == Opcode.MESSAGE:
+                if len(body) < _MESSAGE.size:
+                    return found, "a message record is too short"
                 number, _, log_ns, _ = _MESSAGE.unpack_from(body)
                 if (channel := self._by_id.get(number)) is not None:
                     found.append(Message(log_ns, channel, body[_MESSAGE.size :]))

@@ -24,7 +24,7 @@ Buffer = bytes | memoryview
 LARGEST_BLOCK_BYTES = 2**30
 
 
-class BlockDamaged(Exception):
+class DamagedBlockError(Exception):
     """Stored bytes that cannot be unpacked; the text is a clause that says why."""
 
 
@@ -160,7 +160,7 @@ class BlockLog(MessageLog):
         """The messages of one block in the order of the file, and what is wrong with it (or "").
 
         Raises:
-            BlockDamaged: nothing of the block can be used.
+            DamagedBlockError: nothing of the block can be used.
         """
 
     def _report(self, what: str, offset: int, lost_bytes: int) -> None:
@@ -174,8 +174,10 @@ class BlockLog(MessageLog):
     def _read_block(self, offset: int, size: int, *, torn: bool = False) -> list[Message]:
         """Messages of the block at `offset`, in the order of log time; its damage is noted once."""
         try:
+            if size > LARGEST_BLOCK_BYTES:
+                raise DamagedBlockError(f"a chunk is said to have {size} bytes, more than are read at once")
             messages, problem = self._unpack(memoryview(self._bytes(offset, size)), torn)
-        except BlockDamaged as error:
+        except DamagedBlockError as error:
             messages, problem = [], str(error)
         if problem and offset not in self._reported:
             self._reported.add(offset)
@@ -251,12 +253,14 @@ def inflate(compression: str, data: Buffer, size: int, *, torn: bool = False) ->
     No more than `size` bytes are ever unpacked, so a false claim in the data costs no memory.
 
     Raises:
-        BlockDamaged: unknown compression, damaged data, or another size than the chunk states.
+        DamagedBlockError: unknown compression, damaged data, or another size than the chunk states.
     """
     if compression in ("", "none"):
         return data
     if size > LARGEST_BLOCK_BYTES:
-        raise BlockDamaged(f"a chunk claims {size} bytes, more than the {LARGEST_BLOCK_BYTES} that are unpacked at once")
+        raise DamagedBlockError(
+            f"a chunk claims {size} bytes, more than the {LARGEST_BLOCK_BYTES} that are unpacked at once"
+        )
     try:
         if compression == "zstd":
             found = zstandard.ZstdDecompressor().stream_reader(data).read(size + 1)
@@ -265,11 +269,11 @@ def inflate(compression: str, data: Buffer, size: int, *, torn: bool = False) ->
         elif compression == "bz2":
             found = bz2.BZ2Decompressor().decompress(data, size + 1)
         else:
-            raise BlockDamaged(f"a chunk has the unknown compression {compression!r}")
+            raise DamagedBlockError(f"a chunk has the unknown compression {compression!r}")
     except (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError, MemoryError) as error:
-        raise BlockDamaged(f"a {compression} chunk cannot be unpacked ({error})") from error
+        raise DamagedBlockError(f"a {compression} chunk cannot be unpacked ({error})") from error
     if len(found) != size and not torn:
-        raise BlockDamaged(f"a {compression} chunk states {size} bytes and holds {len(found)}")
+        raise DamagedBlockError(f"a {compression} chunk states {size} bytes and holds {len(found)}")
     return memoryview(found)
 
 

@@ -13,17 +13,21 @@ import sqlite3
 import struct
 from collections.abc import Collection, Iterable, Iterator
 from functools import partial
-from pathlib import Path
+from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
-from typing import Any
+from typing import Any, NamedTuple
 from urllib.parse import quote
+
+import zstandard
+from ruamel.yaml import YAML
+from ruamel.yaml.error import YAMLError
 
 from readers.message_log import (
     Block,
-    BlockDamaged,
     BlockLog,
     Buffer,
     Channel,
+    DamagedBlockError,
     Message,
     MessageLog,
     Source,
@@ -41,7 +45,7 @@ _U64 = struct.Struct("<Q")
 Fields = dict[bytes, bytes]
 
 
-class Torn(Exception):
+class TornError(Exception):
     """Records that break off."""
 
 
@@ -49,12 +53,12 @@ def _fields(header: Buffer) -> Fields:
     raw, at, found = bytes(header), 0, {}
     while at < len(raw):
         if at + 4 > len(raw):
-            raise Torn
+            raise TornError
         (length,) = _U32.unpack_from(raw, at)
         at += 4 + length
         name, separator, value = raw[at - length : at].partition(b"=")
         if at > len(raw) or not separator:
-            raise Torn
+            raise TornError
         found[name] = value
     return found
 
@@ -63,7 +67,7 @@ def _split(data: memoryview) -> Iterator[tuple[int, Fields, memoryview]]:
     """Operation code, header fields and data of each record.
 
     Raises:
-        Torn: a record does not fit into `data`.
+        TornError: a record does not fit into `data`.
     """
     at = 0
     while at < len(data):
@@ -73,10 +77,10 @@ def _split(data: memoryview) -> Iterator[tuple[int, Fields, memoryview]]:
             at += 4 + length
             (length,) = _U32.unpack_from(data, at)
         except struct.error as error:
-            raise Torn from error
+            raise TornError from error
         body = data[at + 4 : at + 4 + length]
         if len(body) < length:
-            raise Torn
+            raise TornError
         at += 4 + length
         fields = _fields(header)
         yield _operation(fields), fields, body
@@ -107,7 +111,8 @@ class Ros1Log(BlockLog):
             if fault:
                 self._by_id, self.channels, self._blocks = {}, [], []
                 self._scan(start, fault)
-            self._find_edges()
+            else:
+                self._find_edges()
         except BaseException:
             self.close()
             raise
@@ -116,16 +121,16 @@ class Ros1Log(BlockLog):
         """Header fields of the record at `offset`, where its data begin, and how long they should be.
 
         Raises:
-            Torn: there is no whole header.
+            TornError: there is no whole header.
         """
         try:
             (length,) = _U32.unpack(self._bytes(offset, 4))
             header = self._bytes(offset + 4, length)
             (data_length,) = _U32.unpack(self._bytes(offset + 4 + length, 4))
         except struct.error as error:
-            raise Torn from error
+            raise TornError from error
         if length == 0:
-            raise Torn
+            raise TornError
         return _fields(header), offset + 8 + length, data_length
 
     def _read_bag_header(self) -> tuple[int, tuple[int, int, int]]:
@@ -137,7 +142,7 @@ class Ros1Log(BlockLog):
             place = _U64.unpack(fields[b"index_pos"])[0]
             connections = _U32.unpack(fields[b"conn_count"])[0]
             chunks = _U32.unpack(fields[b"chunk_count"])[0]
-        except (Torn, KeyError, struct.error):
+        except (TornError, KeyError, struct.error):
             return len(MAGIC), (0, 0, 0)
         if encryptor := fields.get(b"encryptor"):
             raise RecordingError(
@@ -153,6 +158,8 @@ class Ros1Log(BlockLog):
         if not 0 < place <= self._size:
             return "the bag was not closed (it has no index at the stated place)"
         try:
+            if place < self._size and _operation(self._record_at(place)[0]) not in (_CONNECTION, _CHUNK_INFO):
+                return "the index is not at the stated place"
             infos = []
             for operation, fields, body in _split(memoryview(self._bytes(place, self._size - place))):
                 if operation == _CONNECTION:
@@ -164,7 +171,7 @@ class Ros1Log(BlockLog):
             if (len(self._by_id), len(infos)) != (connections, chunks):
                 return "the index is not the one that the bag header announces"
             self._take_chunk_infos(infos, place)
-        except (Torn, KeyError, struct.error):
+        except (TornError, KeyError, struct.error):
             return "the index is damaged"
         return ""
 
@@ -210,17 +217,21 @@ class Ros1Log(BlockLog):
                 torn = data + length > self._size
                 if operation == _CHUNK:
                     found = self._take(offset, min(data + length, self._size) - offset, torn=torn)
-                    lost = f"; of its last chunk {found} messages are read" if torn else ""
+                    lost = f", {found} messages of its last chunk can be read" if torn else ""
                 elif operation == _CONNECTION and not torn:
                     self._connect(fields, memoryview(self._bytes(data, length)))
                 elif operation not in (_INDEX, _CHUNK_INFO, _CONNECTION):
                     break
                 if torn:
                     break
-            except (Torn, KeyError, struct.error):
+            except (TornError, KeyError, struct.error):
                 break
             offset = data + length
-        self._report(f"{fault}{lost or '; what is there is read'}", offset, self._size - min(offset, self._size))
+        self._report(
+            f"{fault}{lost or ', what is there can be read'}; the damage begins",
+            offset,
+            self._size - min(offset, self._size),
+        )
 
     def _take(self, offset: int, size: int, *, torn: bool) -> int:
         messages = self._read_block(offset, size, torn=torn)
@@ -236,11 +247,11 @@ class Ros1Log(BlockLog):
             (size,) = _U32.unpack_from(raw, 4 + length)
             compression = text(fields[b"compression"])
             (unpacked_size,) = _U32.unpack(fields[b"size"])
-        except (Torn, KeyError, struct.error) as error:
-            raise BlockDamaged("no chunk begins where one should") from error
+        except (TornError, KeyError, struct.error) as error:
+            raise DamagedBlockError("no chunk begins where one should") from error
         packed = raw[8 + length :][:size]
         if len(packed) < size and not torn:
-            raise BlockDamaged(f"a chunk states {size} bytes and {len(packed)} are there")
+            raise DamagedBlockError(f"a chunk states {size} bytes and {len(packed)} are there")
         found: list[Message] = []
         strangers = 0
         try:
@@ -253,7 +264,7 @@ class Ros1Log(BlockLog):
                         strangers += 1
                     else:
                         found.append(Message(_time_ns(header[b"time"]), channel, body))
-        except (Torn, KeyError, struct.error):
+        except (TornError, KeyError, struct.error):
             return found, "" if torn else "the records of a chunk break off"
         return found, f"{strangers} messages are of connections that the bag does not describe" if strangers else ""
 
@@ -293,14 +304,18 @@ class SqliteLog(MessageLog):
         copy = Path(self._copy.name) / self.path.name
         for file in (self.path, *pending):
             shutil.copyfile(file, copy.with_name(file.name))
-        self.notes.append(f"{pending[0].name} lies beside the database; both were copied and merged in a temporary folder.")
+        self.notes.append(
+            f"{pending[0].name} lies beside the database; both were copied and merged in a temporary folder."
+        )
         return sqlite3.connect(copy, check_same_thread=False)
 
     def _list_channels(self) -> None:
         try:
             self._read_tables()
             counted = list(
-                self._database.execute("SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY 1")
+                self._database.execute(
+                    "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY 1"
+                )
             )
         except sqlite3.DatabaseError as error:
             self._salvage(str(error))
@@ -376,27 +391,30 @@ class SqliteLog(MessageLog):
             self._read_tables()
         except sqlite3.DatabaseError as error:
             raise RecordingError(self.path, f"the database is damaged ({fault})", cure) from error
-        last, failures = 0, 0
-        while failures < self._GIVE_UP_ROWS:
-            try:
-                query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id LIMIT ?"
-                limit = 1 if failures else -1
-                previous = last
-                for last, number, log_ns, _ in self._database.execute(query, (last, limit)):  # noqa: B007
-                    failures = 0
-                    if number in self._by_id and isinstance(log_ns, int):
-                        self._rows.append((log_ns, last, number))
-                if last == previous:
-                    break
-            except sqlite3.DatabaseError:
-                failures += 1
-                last += 1
+        self._list_rows()
         if not self._rows:
             raise RecordingError(self.path, f"no message of the database can be read ({fault})", cure)
         self._rows.sort()
         for log_ns, _, number in self._rows:
             self._by_id[number].note(log_ns)
-        self._harm(f"{fault}; {len(self._rows)} messages could be read", "table messages", self._missing_share())
+        share = self._missing_share()
+        where = "the pages beyond the end of the file" if share > 0 else "some of its pages"
+        self._harm(f"{len(self._rows)} messages could be read, the others are lost: {fault}", where, share)
+
+    def _list_rows(self) -> None:
+        """Collect (log time, row, topic) of what can be read; step over rows that cannot, up to a limit."""
+        assert self._rows is not None
+        query = "SELECT id, topic_id, timestamp, data FROM messages WHERE id > ? ORDER BY id"
+        last, failures = 0, 0
+        while failures < self._GIVE_UP_ROWS:
+            try:
+                for row, number, log_ns, _ in self._database.execute(query, (last,)):
+                    last, failures = row, 0
+                    if number in self._by_id and isinstance(log_ns, int):
+                        self._rows.append((log_ns, row, number))
+                return
+            except sqlite3.DatabaseError:
+                last, failures = last + 1, failures + 1
 
     def _missing_share(self) -> float:
         """Share of the pages that the header announces and the file does not have, NaN if that is not the fault."""
@@ -423,3 +441,49 @@ class SqliteLog(MessageLog):
 def natural_key(name: str) -> list[tuple[int, str]]:
     """Sort key by which ``part_10`` comes after ``part_9``."""
     return [(int(part), "") if part.isdigit() else (-1, part) for part in re.split(r"(\d+)", name)]
+
+
+# ---------------------------------------------------------------------------------- folders
+
+
+class BagMetadata(NamedTuple):
+    """What a ROS 2 bag's metadata.yaml says: its files (None if it cannot tell) and each topic's serialisation."""
+
+    files: list[str] | None
+    formats: dict[str, str]
+    remarks: list[str]
+
+
+def read_metadata(folder: Path) -> BagMetadata:
+    """Read metadata.yaml of a ROS 2 bag, if there is one.
+
+    Only the last part of a stated path counts, so nothing outside of the folder is opened.
+    """
+    metadata = folder / "metadata.yaml"
+    if not metadata.is_file():
+        return BagMetadata(None, {}, ["The bag has no metadata.yaml; its files were found by their names."])
+    try:
+        stated = YAML(typ="safe", pure=True).load(metadata.read_text("utf-8"))["rosbag2_bagfile_information"]
+        files = [PurePosixPath(str(name)).name for name in stated["relative_file_paths"]]
+        topics = [entry["topic_metadata"] for entry in stated.get("topics_with_message_count") or ()]
+        return BagMetadata(files, {str(t["name"]): str(t["serialization_format"]) for t in topics}, [])
+    except (YAMLError, UnicodeDecodeError, LookupError, TypeError, AttributeError):
+        return BagMetadata(None, {}, ["metadata.yaml cannot be parsed; the bag's files were found by their names."])
+
+
+def unpack(path: Path, scratch: list[TemporaryDirectory[str]]) -> Path:
+    """Unpack a zstd file into a temporary folder, which is made and added to `scratch` if there is none.
+
+    Raises:
+        RecordingError: the file cannot be unpacked.
+    """
+    if not scratch:
+        scratch.append(TemporaryDirectory(prefix="workbench-"))
+    target = Path(scratch[0].name) / (path.stem if path.suffix in (".zstd", ".zst") else path.name)
+    try:
+        with path.open("rb") as packed, target.open("wb") as plain:
+            stream = zstandard.ZstdDecompressor().stream_reader(packed, read_across_frames=True)
+            shutil.copyfileobj(stream, plain, 1 << 20)
+    except zstandard.ZstdError as error:
+        raise RecordingError(path, f"it cannot be unpacked ({error})", "copy it again") from error
+    return target
