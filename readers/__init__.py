@@ -111,7 +111,10 @@ def _open_log(path: Path, scratch: list[TemporaryDirectory[str]]) -> MessageLog 
     if start.startswith(ZSTD):
         from readers.rosbag import unpack
 
-        return _open_log(unpack(path, scratch), scratch)
+        try:
+            return _open_log(unpack(path, scratch), scratch)
+        except RecordingError as error:
+            raise RecordingError(path, f"inside of the zstd file: {error.problem}", error.cure) from error
     for magic, (problem, cure) in REFUSED.items():
         if start.startswith(magic):
             raise RecordingError(path, problem, cure)
