@@ -183,7 +183,8 @@ class McapLog(BlockLog):
             head = self._bytes(offset, _HEAD.size)
             opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
             end = offset + _HEAD.size + length
-            if run_start >= 0 and (opcode != Opcode.MESSAGE or end - run_start > RUN_BYTES):
+            run_ends = opcode != Opcode.MESSAGE or end > self._size or end - run_start > RUN_BYTES
+            if run_start >= 0 and run_ends:
                 self._take(run_start, offset - run_start)
                 run_start = -1
             if opcode in (Opcode.DATA_END, Opcode.FOOTER):

@@ -200,21 +200,18 @@ class BlockLog(MessageLog):
         self._blocks.append(Block(offset, size, messages[0].log_ns, messages[-1].log_ns, channels, torn))
 
     def _find_edges(self) -> None:
-        """Fill in the first and last log time of every channel from the blocks at its two ends."""
-        wanted: dict[Block, set[Channel]] = {}
-        for blocks in (
-            sorted(self._blocks, key=lambda b: -b.first_ns),
-            sorted(self._blocks, key=lambda b: b.last_ns),
-        ):
-            edge = {channel: block for block in blocks for channel in block.channels}
-            for channel, block in edge.items():
-                wanted.setdefault(block, set()).add(channel)
-        for block, channels in wanted.items():
-            for message in self._load(block):
-                if message.channel in channels:
-                    channel = message.channel
-                    times = [t for t in (message.log_ns, channel.first_ns, channel.last_ns) if t >= 0]
-                    channel.first_ns, channel.last_ns = min(times), max(times)
+        """Fill in the first and last log time of every channel, from the blocks that can hold them."""
+        for block in sorted(self._blocks, key=lambda b: b.first_ns):
+            open_ends = {c for c in block.channels if c.first_ns < 0 or block.first_ns < c.first_ns}
+            for message in self._load(block) if open_ends else ():
+                channel = message.channel
+                if channel in open_ends and (channel.first_ns < 0 or message.log_ns < channel.first_ns):
+                    channel.first_ns = message.log_ns
+        for block in sorted(self._blocks, key=lambda b: -b.last_ns):
+            open_ends = {c for c in block.channels if block.last_ns > c.last_ns}
+            for message in self._load(block) if open_ends else ():
+                if message.channel in open_ends:
+                    message.channel.last_ns = max(message.channel.last_ns, message.log_ns)
 
     def _select(
         self, block: Block, channels: Collection[Channel], start_ns: int | None, stop_ns: int | None

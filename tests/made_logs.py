@@ -196,7 +196,9 @@ def raw_ros(entries: Iterable[Entry], generation: int) -> Iterator[Raw]:
             yield Raw(topic, schema, "cdr", log_ns, bytes(store.serialize_cdr(message, kind)))
 
 
-def write_mcap(path: Path, messages: Iterable[Raw], profile: str = "", compression: str = "none", **options: Any) -> Path:
+def write_mcap(
+    path: Path, messages: Iterable[Raw], profile: str = "", compression: str = "none", **options: Any
+) -> Path:
     path.write_bytes(mcap_bytes(messages, profile, compression, **options))
     return path
 
