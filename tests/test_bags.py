@@ -361,7 +361,7 @@ def test_zeroed_pages_of_a_database_cost_only_their_rows(tmp_path: Path) -> None
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
-def test_a_torn_database_gives_its_first_rows(tmp_path: Path, share: float) -> None:
+def test_a_torn_database_gives_the_rows_that_are_left(tmp_path: Path, share: float) -> None:
     path = write_ros2(tmp_path / "bag", drive(ROS2, 5.0)) / "bag.db3"
     data = path.read_bytes()
     path.write_bytes(data[: int(len(data) * share)])
@@ -369,8 +369,9 @@ def test_a_torn_database_gives_its_first_rows(tmp_path: Path, share: float) -> N
     with open_recording(path) as recording:
         assert recording.damage[0].affected == pytest.approx(1 - share, abs=0.02)
         found = [s.t_ns for s in recording.read(["/imu"])]
-    assert found == [START_NS + i * 10 * MS for i in range(len(found))]
-    assert 0.7 * share * 500 < len(found) <= 500
+    assert found == sorted(set(found) & {START_NS + i * 10 * MS for i in range(500)})
+    assert found[:100] == [START_NS + i * 10 * MS for i in range(100)]
+    assert 0.7 * share * 500 < len(found) < 500
     assert snapshot(tmp_path) == before
 
 
