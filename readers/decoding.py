@@ -25,7 +25,7 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped, 
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
-from readers.message_log import Buffer, Channel, text
+from readers.message_log import LARGEST_BLOCK_BYTES, Buffer, Channel, text
 
 Decoder = Callable[[Buffer], Any]
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
@@ -77,10 +77,12 @@ def _ros_decoder(encoding: str, type_name: str, schema_encoding: str, schema: by
     deserialize = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
 
     def decode(data: Buffer) -> Any:
-        if encoding == "cdr" and data[:4] == ZSTD_MAGIC:
-            data = zstandard.ZstdDecompressor().decompressobj().decompress(data)
         try:
+            if encoding == "cdr" and data[:4] == ZSTD_MAGIC:
+                data = zstandard.ZstdDecompressor().stream_reader(data).read(LARGEST_BLOCK_BYTES)
             return deserialize(data, name)
+        except zstandard.ZstdError as error:
+            raise MessageError(f"the message cannot be unpacked ({error})") from error
         except (SerdeError, TypesysError, KeyError, AssertionError, OverflowError, MemoryError) as error:
             raise MessageError(f"the message does not fit {type_name} ({error})") from error
 

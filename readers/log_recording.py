@@ -45,7 +45,7 @@ from readers.streams import (
 
 SLACK_NS = 2 * SECOND_NS
 FIRST_MESSAGES = 10
-FRAME_SEARCH_NS = 60 * SECOND_NS
+FRAME_SEARCH_NS = 30 * SECOND_NS
 
 
 @dataclass(slots=True)
@@ -214,9 +214,12 @@ class LogRecording(Recording):
         times: dict[str, list[int]] = {}
         lags: list[int] = []
         wanted = {pair_stream(topic.name, *pair) for pair in self._options.pose_frames}
+        problems = 0
         for message in self._messages(topic.channels, None, stop_ns) if whole.count else ():
             for sample in topic.samples(message):
-                if not isinstance(sample, Problem) and (not wanted or sample.stream in wanted):
+                if isinstance(sample, Problem):
+                    problems += 1
+                elif not wanted or sample.stream in wanted:
                     times.setdefault(sample.stream, []).append(sample.received_ns)
                     lags.append(sample.received_ns - sample.t_ns)
         seen_all = whole.last_ns < stop_ns
@@ -224,6 +227,7 @@ class LogRecording(Recording):
             self._note(f"{topic.name}: frame pairs were looked for in its first {FRAME_SEARCH_NS // SECOND_NS} s; "
                        "name others by pose_frames.")  # fmt: skip
         names = sorted(wanted or times)
+        counts = {name: len(times.get(name, ())) + problems * (name == names[0]) for name in names}
         topic.lag_ns = int(statistics.median(lags)) if lags else 0
         topic.pairs = tuple(
             StreamInfo(
@@ -231,7 +235,7 @@ class LogRecording(Recording):
                 kind=StreamKind.POSE,
                 type=whole.type,
                 encoding=whole.encoding,
-                count=len(times.get(name, ())) if seen_all else -1,
+                count=counts[name] if seen_all else -1,
                 first_ns=min(times.get(name, ()), default=-1),
                 last_ns=max(times.get(name, ()), default=-1) if seen_all else whole.last_ns,
                 frame=name.rpartition(":")[2].partition("->")[0],

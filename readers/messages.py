@@ -70,6 +70,11 @@ class Arrival:
     trust_stamps: bool = True
     oddities: list[str] = field(default_factory=list)
 
+    @property
+    def source(self) -> str:
+        """The message, for people to find it again."""
+        return f"{self.stream}, logged at {self.received_ns} ns"
+
     def stamps(self, stamp: Any = None) -> Stamps:
         """The times of the sample: its own stamp where that is sane, else the log time, which is noted.
 
@@ -176,6 +181,7 @@ def image(message: Any, arrival: Arrival) -> ImageSample:
         height_px=height,
         step_bytes=step,
         big_endian=bool(getattr(message, "is_bigendian", False)),
+        source=arrival.source,
     )
 
 
@@ -187,7 +193,10 @@ def compressed_image(message: Any, arrival: Arrival) -> ImageSample:
     if not payload:
         raise MessageError("the image holds no bytes")
     return ImageSample(
-        **arrival.stamps(header_stamp(message)), encoding=compressed_format(payload, message.format), payload=payload
+        **arrival.stamps(header_stamp(message)),
+        encoding=compressed_format(payload, message.format),
+        payload=payload,
+        source=arrival.source,
     )
 
 

@@ -309,20 +309,23 @@ class SqliteLog(MessageLog):
         )
         return sqlite3.connect(copy, check_same_thread=False)
 
+    _COUNT = (
+        "SELECT topic_id, typeof(timestamp) = 'integer', count(*), min(timestamp), max(timestamp)"
+        " FROM messages GROUP BY 1, 2"
+    )
+
     def _list_channels(self) -> None:
         try:
             self._read_tables()
-            counted = list(
-                self._database.execute(
-                    "SELECT topic_id, count(*), min(timestamp), max(timestamp) FROM messages GROUP BY 1"
-                )
-            )
+            counted = list(self._database.execute(self._COUNT))
         except sqlite3.DatabaseError as error:
             self._salvage(str(error))
             return
-        for number, count, first_ns, last_ns in counted:
-            if (channel := self._by_id.get(number)) is not None:
-                channel.count, channel.first_ns, channel.last_ns = count, int(first_ns), int(last_ns)
+        for number, timed, count, first_ns, last_ns in counted:
+            if not timed:
+                self._harm(f"{count} messages have no number as time and are left out", "table messages")
+            elif (channel := self._by_id.get(number)) is not None:
+                channel.count, channel.first_ns, channel.last_ns = count, first_ns, last_ns
             else:
                 self._harm(f"{count} messages are of a topic that the database does not describe", "table messages")
 
@@ -362,13 +365,13 @@ class SqliteLog(MessageLog):
 
     def _messages(self, rows: Iterator[tuple[int, int, Any]]) -> Iterator[Message]:
         for number, log_ns, data in rows:
-            yield Message(int(log_ns), self._by_id[number], data.encode() if isinstance(data, str) else data or b"")
+            yield Message(log_ns, self._by_id[number], data.encode() if isinstance(data, str) else data or b"")
 
     def _sound_rows(self, numbers: list[int], start_ns: int, stop_ns: int) -> Iterator[tuple[int, int, Any]]:
         marks = ", ".join("?" * len(numbers))
         query = (
             "SELECT topic_id, timestamp, data FROM messages WHERE timestamp >= ? AND timestamp < ?"
-            f" AND topic_id IN ({marks}) ORDER BY timestamp, id"
+            f" AND typeof(timestamp) = 'integer' AND topic_id IN ({marks}) ORDER BY timestamp, id"
         )
         try:
             yield from self._database.execute(query, (start_ns, stop_ns, *numbers))

@@ -211,6 +211,18 @@ def test_named_frame_pairs_become_the_only_tf_streams(tmp_path: Path) -> None:
     assert {(s.parent_frame, s.child_frame) for s in samples} == {("odom", "base")}
 
 
+def test_a_broken_tf_message_is_one_problem(tmp_path: Path) -> None:
+    folder = write_ros2(tmp_path / "bag", drive(ROS2))
+    with sqlite3.connect(folder / "bag.db3") as database:
+        (topic,) = database.execute("SELECT id FROM topics WHERE name = '/tf'").fetchone()
+        (row,) = database.execute("SELECT max(id) FROM messages WHERE topic_id = ?", (topic,)).fetchone()
+        database.execute("UPDATE messages SET data = x'0001' WHERE id = ?", (row,))
+    database.close()
+    with open_recording(folder) as recording:
+        assert sum(isinstance(s, Problem) for s in recording.read()) == 1
+        assert {f.code for f in survey(recording)} == {"undecodable"}
+
+
 def test_camera_belongs_to_the_image_of_its_namespace(tmp_path: Path) -> None:
     with open_recording(write_ros1(tmp_path / "a.bag", drive(ROS1))) as recording:
         camera = recording.cameras["/cam/image_raw"]
@@ -358,6 +370,18 @@ def test_zeroed_pages_of_a_database_cost_only_their_rows(tmp_path: Path) -> None
         found = sum(1 for _ in recording.read(["/imu"]))
         assert 900 < found < 1000
         assert "messages could be read" in recording.damage[0].what or "reading stopped" in recording.damage[0].what
+
+
+def test_rows_without_data_or_time_are_counted(tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "bag", [e for e in drive(ROS2) if e.topic == "/imu"]) / "bag.db3"
+    with sqlite3.connect(path) as database:
+        database.execute("UPDATE messages SET timestamp = 'noon' WHERE id = 5")
+        database.execute("UPDATE messages SET data = '' WHERE id = 6")
+    database.close()
+    with open_recording(path) as recording:
+        samples = list(recording.read())
+        assert [isinstance(s, Problem) for s in samples] == [i == 4 for i in range(199)]
+        assert "1 messages have no number as time" in recording.damage[0].what
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])
