@@ -8,12 +8,12 @@ from __future__ import annotations
 import heapq
 import statistics
 from collections import Counter
-from collections.abc import Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from readers.streams import Fact, ImageSample, Problem, Sample
+from readers.streams import Fact, ImageSample, Problem, Recording, Sample
 
 SECOND_NS = 1_000_000_000
 DAY_NS = 86_400 * SECOND_NS
@@ -29,16 +29,17 @@ def sane_stamp(header_ns: int, received_ns: int) -> bool:
     return header_ns > 0 and abs(header_ns - received_ns) <= DAY_NS
 
 
-def reorder(samples: Iterable[Sample], window_ns: int = REORDER_WINDOW_NS) -> Iterator[Sample]:
+def reorder(samples: Iterable[Sample], window_ns: int = REORDER_WINDOW_NS, *, lag_ns: int = 0) -> Iterator[Sample]:
     """Bring samples that come in log order into the order of `t_ns`, within a bounded delay.
 
     A sample waits until the log is `window_ns` further than its own stamp; one that comes later than
-    that is passed on at once, out of order, and `StreamAudit` counts it.
+    that is passed on at once, out of order, and `StreamAudit` counts it. `lag_ns` is by how much the
+    log time usually exceeds the stamps: zero unless the sensor's clock is another one.
     """
     heap: list[tuple[int, int, Sample]] = []
     for number, sample in enumerate(samples):
         heapq.heappush(heap, (sample.t_ns, number, sample))
-        horizon = sample.received_ns - window_ns
+        horizon = sample.received_ns - lag_ns - window_ns
         while heap and heap[0][0] <= horizon:
             yield heapq.heappop(heap)[2]
     while heap:
@@ -69,6 +70,7 @@ class StreamAudit:
     def add(self, sample: Sample) -> None:
         """Take note of the next sample of this stream."""
         self.samples += 1
+        self.counts.update(sample.oddities)
         if isinstance(sample, Problem):
             self.counts["undecodable"] += 1
             return
@@ -105,7 +107,11 @@ class StreamAudit:
             "undecodable": "messages could not be decoded",
             "out_of_order": "stamps lie before an earlier one",
             "duplicate_stamp": "stamps repeat the one before",
+            "foreign_stamp": "header stamps are of another epoch; log time was used",
+            "frozen_stamp": "header stamps never advance; log time was used",
             "zero_quaternion": "quaternions are all zero and were read as unknown",
+            "quaternion_norm": "quaternions are not of unit norm and were scaled",
+            "identity_orientation": "orientations are the identity with zero covariance, as if never measured; kept",
             "size_change": "images differ in size from the one before",
             "gap": f"gaps are longer than {GAP_FACTOR:g} usual steps, the longest {self.longest_gap_ns / 1e9:.3f} s",
         }
@@ -113,3 +119,30 @@ class StreamAudit:
             Fact(stream=self.stream, code=code, count=n, sentence=f"{n} {sentences[code]}")
             for code, n in sorted(found.items())
         )
+
+
+def survey(recording: Recording, progress: Callable[[int, int], None] | None = None) -> tuple[Fact, ...]:
+    """Read every readable stream once, without decoding images, and count what is odd.
+
+    `progress` is called about every thousand samples with the number read and the number expected.
+
+    Raises:
+        RecordingError: nothing more of the file can be read.
+    """
+    readable = [info for info in recording.streams if info.readable]
+    audits = {info.name: StreamAudit(info.name) for info in readable}
+    expected = sum(max(info.count, 0) for info in readable)
+    done = 0
+    for done, sample in enumerate(recording.read(), start=1):
+        audits[sample.stream].add(sample)
+        if progress is not None and done % 1000 == 0:
+            progress(done, max(done, expected))
+    if progress is not None:
+        progress(done, done)
+    facts = [fact for info in readable for fact in audits[info.name].facts()]
+    for info in readable:
+        missing = info.count - audits[info.name].samples
+        if info.count >= 0 and missing:
+            sentence = f"{abs(missing)} messages {'fewer' if missing > 0 else 'more'} than the file states"
+            facts.append(Fact(stream=info.name, code="count_differs", count=abs(missing), sentence=sentence))
+    return tuple(facts)

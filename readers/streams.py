@@ -73,12 +73,15 @@ class Sample:
     """One timestamped datum of a stream.
 
     `t_ns` is the sensor's time (the header stamp where it is sane, else the log time);
-    `received_ns` is the log time. Both are integer nanoseconds of the same epoch.
+    `received_ns` is the log time. Both are integer nanoseconds of the same epoch. `oddities` are the
+    codes of what the reader met in this one message and how it took it, such as ``foreign_stamp``;
+    `readers.clock.StreamAudit` counts them and has a sentence for each.
     """
 
     stream: str
     t_ns: int
     received_ns: int
+    oddities: tuple[str, ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -1,0 +1,158 @@
+"""Serialised bytes → message objects with attributes, for ROS 1, CDR, JSON and protobuf.
+
+Definitions come from the log; only where it has none are those of a distribution used (the latest
+of ROS 2, Noetic of ROS 1). Both are `rosbags`' type system. Every channel has types of its own, so that
+one bad definition harms no other topic.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from functools import lru_cache
+from types import SimpleNamespace
+from typing import Any
+
+import zstandard
+from google.protobuf import (  # type: ignore[import-untyped, unused-ignore]
+    descriptor_pb2,
+    descriptor_pool,
+    duration_pb2,
+    message_factory,
+    timestamp_pb2,
+)
+from google.protobuf.message import DecodeError  # type: ignore[import-untyped, unused-ignore]
+from rosbags.serde import SerdeError
+from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
+
+from readers.message_log import LARGEST_BLOCK_BYTES, Buffer, Channel, text
+
+Decoder = Callable[[Buffer], Any]
+ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
+_WELL_KNOWN = {module.DESCRIPTOR.name: module.DESCRIPTOR for module in (duration_pb2, timestamp_pb2)}
+_IDL_RULE = "=" * 80 + "\n"
+
+
+class MessageError(Exception):
+    """A message, or the definition of one, that cannot be used; the text is a clause that says why."""
+
+
+def decoder_of(channel: Channel) -> Decoder:
+    """The function that turns the bytes of the channel's messages into objects with attributes.
+
+    Raises:
+        MessageError: the encoding is not supported, or the definition cannot be parsed.
+    """
+    if channel.encoding in ("ros1", "cdr"):
+        return _ros_decoder(channel.encoding, channel.type, channel.schema_encoding, channel.schema)
+    if channel.encoding == "json":
+        return _decode_json
+    if channel.encoding == "protobuf":
+        return _protobuf_decoder(channel.type, channel.schema)
+    raise MessageError(f"serialization format {channel.encoding!r} is not supported")
+
+
+def definition_text(channel: Channel) -> str:
+    """The channel's definition for people to read."""
+    if channel.schema_encoding != "protobuf":
+        return text(channel.schema)
+    try:
+        return str(descriptor_pb2.FileDescriptorSet.FromString(channel.schema))
+    except DecodeError:
+        return f"{len(channel.schema)} bytes that are no FileDescriptorSet"
+
+
+def ros_name(name: str) -> str:
+    """The long form of a ROS type name: ``sensor_msgs/Imu`` → ``sensor_msgs/msg/Imu``."""
+    package, _, rest = name.partition("/")
+    return name if "/" in rest or not rest else f"{package}/msg/{rest}"
+
+
+@lru_cache(maxsize=256)
+def _ros_decoder(encoding: str, type_name: str, schema_encoding: str, schema: bytes) -> Decoder:
+    name = ros_name(type_name)
+    store = _types_of_log(name, schema_encoding, schema) if schema.strip() else _types_of_distribution(encoding)
+    if name not in store.fielddefs:
+        raise MessageError(f"the log has no definition of {type_name} and the distribution has none either")
+    deserialize = store.deserialize_ros1 if encoding == "ros1" else store.deserialize_cdr
+
+    def decode(data: Buffer) -> Any:
+        try:
+            if encoding == "cdr" and data[:4] == ZSTD_MAGIC:
+                data = zstandard.ZstdDecompressor().stream_reader(data).read(LARGEST_BLOCK_BYTES)
+            return deserialize(data, name)
+        except zstandard.ZstdError as error:
+            raise MessageError(f"the message cannot be unpacked ({error})") from error
+        except (SerdeError, TypesysError, KeyError, AssertionError, OverflowError, MemoryError) as error:
+            raise MessageError(f"the message does not fit {type_name} ({error})") from error
+
+    return decode
+
+
+def _types_of_log(name: str, schema_encoding: str, schema: bytes) -> Any:
+    definition = text(schema)
+    try:
+        types = _idl_types(definition) if "idl" in schema_encoding else get_types_from_msg(definition, name)
+        store = get_typestore(Stores.EMPTY)
+        store.register(types)
+        store.get_msgdef(name)
+    except (TypesysError, KeyError, ValueError, TypeError, AssertionError, RecursionError, SyntaxError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise MessageError(f"the definition of {name} in the log cannot be parsed ({reason})") from error
+    return store
+
+
+def _idl_types(definition: str) -> Any:
+    types: dict[str, Any] = {}
+    if not definition.startswith(_IDL_RULE + "IDL: "):
+        return get_types_from_idl(definition)
+    for part in definition.split(_IDL_RULE)[1:]:
+        types.update(get_types_from_idl(part.partition("\n")[2]))
+    return types
+
+
+@lru_cache(maxsize=2)
+def _types_of_distribution(encoding: str) -> Any:
+    return get_typestore(Stores.ROS1_NOETIC if encoding == "ros1" else Stores.LATEST)
+
+
+def _decode_json(data: Buffer) -> Any:
+    try:
+        return json.loads(bytes(data), object_hook=lambda fields: SimpleNamespace(**fields))
+    except (ValueError, RecursionError) as error:
+        raise MessageError(f"the message is no JSON ({error})") from error
+
+
+@lru_cache(maxsize=256)
+def _protobuf_decoder(type_name: str, schema: bytes) -> Decoder:
+    try:
+        files = {file.name: file for file in descriptor_pb2.FileDescriptorSet.FromString(schema).file}
+        pool = descriptor_pool.DescriptorPool()
+        added: set[str] = set()
+
+        def add(name: str) -> None:
+            if name in added:
+                return
+            added.add(name)
+            file = files.get(name)
+            if file is None:
+                file = descriptor_pb2.FileDescriptorProto()
+                _WELL_KNOWN[name].CopyToProto(file)
+            for dependency in file.dependency:
+                add(dependency)
+            pool.Add(file)
+
+        for name in files:
+            add(name)
+        message_class = message_factory.GetMessageClass(pool.FindMessageTypeByName(type_name))
+    except (DecodeError, KeyError, TypeError, ValueError) as error:
+        reason = " ".join(str(error).split())[:120]
+        raise MessageError(f"the definition of {type_name} in the log cannot be parsed ({reason})") from error
+
+    def decode(data: Buffer) -> Any:
+        try:
+            return message_class.FromString(bytes(data))
+        except (DecodeError, ValueError) as error:
+            raise MessageError(f"the message does not fit {type_name} ({error})") from error
+
+    return decode

@@ -1,0 +1,279 @@
+"""Containers of messages: what bags and MCAP files have in common, whatever their bytes look like.
+
+A `MessageLog` lists channels and yields their messages as they were stored, in the order of the log
+time. It knows nothing of what a message means; `readers.decoding` and `readers.messages` do.
+"""
+
+from __future__ import annotations
+
+import abc
+import bz2
+import heapq
+from collections.abc import Collection, Iterable, Iterator
+from dataclasses import dataclass, field
+from functools import partial
+from pathlib import Path
+from typing import BinaryIO, NamedTuple, Protocol
+
+import lz4.frame  # type: ignore[import-untyped, unused-ignore]
+import zstandard
+
+from readers.streams import Damage
+
+Buffer = bytes | memoryview
+LARGEST_BLOCK_BYTES = 2**30
+
+
+class DamagedBlockError(Exception):
+    """Stored bytes that cannot be unpacked; the text is a clause that says why."""
+
+
+@dataclass(eq=False, slots=True)
+class Channel:
+    """One source of messages: a topic, the type of its messages and how they are serialised.
+
+    `encoding` is ``ros1``, ``cdr``, ``json``, ``protobuf`` or whatever else the log names;
+    `schema_encoding` is ``ros1msg``, ``ros2msg``, ``ros2idl``, ``jsonschema``, ``protobuf`` or empty.
+    `first_ns` and `last_ns` are log times, -1 without a message.
+    """
+
+    topic: str
+    type: str
+    encoding: str
+    schema_encoding: str = ""
+    schema: bytes = field(default=b"", repr=False)
+    count: int = 0
+    first_ns: int = -1
+    last_ns: int = -1
+
+    def note(self, log_ns: int) -> None:
+        """Count one message that was logged at `log_ns`."""
+        self.count += 1
+        self.first_ns = log_ns if self.first_ns < 0 else min(self.first_ns, log_ns)
+        self.last_ns = max(self.last_ns, log_ns)
+
+
+class Message(NamedTuple):
+    """One message as it was stored, with its log time in nanoseconds."""
+
+    log_ns: int
+    channel: Channel
+    data: Buffer
+
+
+class Opener(Protocol):
+    """Starts to read; gives messages in the order of the log time."""
+
+    def __call__(self) -> Iterator[Message]: ...  # noqa: D102
+
+
+class Source(NamedTuple):
+    """Messages in the order of the log time, none before `first_ns`, not read before `open` is called."""
+
+    first_ns: int
+    open: Opener
+
+
+def in_log_order(sources: Iterable[Source]) -> Iterator[Message]:
+    """Merge sources by log time; a source is opened when the merge has come to its first time.
+
+    So memory is bounded by the sources that overlap in time. Equal times keep the order of the sources.
+    """
+    heap: list[tuple[int, int, Message, Iterator[Message]]] = []
+
+    def advance() -> Message:
+        _, number, message, rest = heap[0]
+        following = next(rest, None)
+        if following is None:
+            heapq.heappop(heap)
+        else:
+            heapq.heapreplace(heap, (following.log_ns, number, following, rest))
+        return message
+
+    for number, source in enumerate(sorted(sources, key=lambda s: s.first_ns)):
+        while heap and heap[0][0] < source.first_ns:
+            yield advance()
+        messages = source.open()
+        if (first := next(messages, None)) is not None:
+            heapq.heappush(heap, (first.log_ns, number, first, messages))
+    while heap:
+        yield advance()
+
+
+class MessageLog(abc.ABC):
+    """One file of messages, open for reading.
+
+    Attributes:
+        path: the file.
+        format: what it was taken for.
+        channels: all channels, with their counts and times.
+        damage: what was found to be damaged so far.
+        notes: choices that the reader made, one sentence each.
+    """
+
+    def __init__(self, path: Path, form: str) -> None:
+        self.path = path
+        self.format = form
+        self.channels: list[Channel] = []
+        self.damage: list[Damage] = []
+        self.notes: list[str] = []
+
+    @abc.abstractmethod
+    def sources(
+        self, channels: Collection[Channel], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterable[Source]:
+        """Where the messages of `channels` with ``start_ns <= log time < stop_ns`` can be read."""
+
+    @abc.abstractmethod
+    def close(self) -> None:
+        """Release the file."""
+
+
+@dataclass(frozen=True, slots=True)
+class Block:
+    """A stretch of a file that is read at once: a chunk, or a run of messages outside of chunks.
+
+    `torn` marks a block that the end of the file cuts: what it holds up to there is read.
+    """
+
+    offset: int
+    size: int
+    first_ns: int
+    last_ns: int
+    channels: frozenset[Channel]
+    torn: bool = False
+
+
+class BlockLog(MessageLog):
+    """A log whose messages lie in blocks, each with a known range of log times."""
+
+    def __init__(self, path: Path, form: str) -> None:
+        super().__init__(path, form)
+        self._file: BinaryIO = path.open("rb")
+        self._size = path.stat().st_size
+        self._blocks: list[Block] = []
+        self._latest: tuple[Block | None, list[Message]] = (None, [])
+        self._reported: set[int] = set()
+
+    @abc.abstractmethod
+    def _unpack(self, raw: memoryview, torn: bool) -> tuple[list[Message], str]:
+        """The messages of one block in the order of the file, and what is wrong with it (or "").
+
+        Raises:
+            DamagedBlockError: nothing of the block can be used.
+        """
+
+    def _report(self, what: str, offset: int, lost_bytes: int) -> None:
+        where = f"byte {offset} of {self._size}"
+        self.damage.append(Damage(what=what, where=where, affected=lost_bytes / max(1, self._size)))
+
+    def _bytes(self, offset: int, size: int) -> bytes:
+        self._file.seek(offset)
+        return self._file.read(max(0, min(size, self._size - offset)))
+
+    def _read_block(self, offset: int, size: int, *, torn: bool = False) -> list[Message]:
+        """Messages of the block at `offset`, in the order of log time; its damage is noted once."""
+        try:
+            if size > LARGEST_BLOCK_BYTES:
+                raise DamagedBlockError(f"a chunk is said to have {size} bytes, more than are read at once")
+            messages, problem = self._unpack(memoryview(self._bytes(offset, size)), torn)
+        except DamagedBlockError as error:
+            messages, problem = [], str(error)
+        if problem and offset not in self._reported:
+            self._reported.add(offset)
+            self._report(problem, offset, size)
+        messages.sort(key=lambda message: message.log_ns)
+        return messages
+
+    def _load(self, block: Block) -> list[Message]:
+        if self._latest[0] is not block:
+            self._latest = (block, self._read_block(block.offset, block.size, torn=block.torn))
+        return self._latest[1]
+
+    def _add_block(self, offset: int, size: int, messages: list[Message], *, torn: bool = False) -> None:
+        """Take a block, found while scanning, into the list and count its messages."""
+        if not messages:
+            return
+        for message in messages:
+            message.channel.note(message.log_ns)
+        channels = frozenset(message.channel for message in messages)
+        self._blocks.append(Block(offset, size, messages[0].log_ns, messages[-1].log_ns, channels, torn))
+
+    def _find_edges(self) -> None:
+        """Fill in the first and last log time of every channel, from the blocks that can hold them."""
+        for block in sorted(self._blocks, key=lambda b: b.first_ns):
+            open_ends = {c for c in block.channels if c.first_ns < 0 or block.first_ns < c.first_ns}
+            for message in self._load(block) if open_ends else ():
+                channel = message.channel
+                if channel in open_ends and (channel.first_ns < 0 or message.log_ns < channel.first_ns):
+                    channel.first_ns = message.log_ns
+        for block in sorted(self._blocks, key=lambda b: -b.last_ns):
+            open_ends = {c for c in block.channels if block.last_ns > c.last_ns}
+            for message in self._load(block) if open_ends else ():
+                if message.channel in open_ends:
+                    message.channel.last_ns = max(message.channel.last_ns, message.log_ns)
+
+    def _select(
+        self, block: Block, channels: Collection[Channel], start_ns: int | None, stop_ns: int | None
+    ) -> Iterator[Message]:
+        for message in self._load(block):
+            if message.channel not in channels:
+                continue
+            if start_ns is not None and message.log_ns < start_ns:
+                continue
+            if stop_ns is not None and message.log_ns >= stop_ns:
+                continue
+            yield message
+
+    def sources(
+        self, channels: Collection[Channel], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterable[Source]:
+        """One source a block that holds one of the channels and overlaps the range."""
+        wanted = frozenset(channels)
+        for block in self._blocks:
+            if start_ns is not None and block.last_ns < start_ns:
+                continue
+            if stop_ns is not None and block.first_ns >= stop_ns:
+                continue
+            if wanted & block.channels:
+                yield Source(block.first_ns, partial(self._select, block, wanted, start_ns, stop_ns))
+
+    def close(self) -> None:
+        """Release the file."""
+        self._latest = (None, [])
+        self._file.close()
+
+
+def inflate(compression: str, data: Buffer, size: int, *, torn: bool = False) -> Buffer:
+    """Unpack a chunk of `size` bytes; of a torn one as much as there is.
+
+    No more than `size` bytes are ever unpacked, so a false claim in the data costs no memory.
+
+    Raises:
+        DamagedBlockError: unknown compression, damaged data, or another size than the chunk states.
+    """
+    if compression in ("", "none"):
+        return data
+    if size > LARGEST_BLOCK_BYTES:
+        raise DamagedBlockError(
+            f"a chunk claims {size} bytes, more than the {LARGEST_BLOCK_BYTES} that are unpacked at once"
+        )
+    try:
+        if compression == "zstd":
+            found = zstandard.ZstdDecompressor().stream_reader(data).read(size + 1)
+        elif compression == "lz4":
+            found = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
+        elif compression == "bz2":
+            found = bz2.BZ2Decompressor().decompress(data, size + 1)
+        else:
+            raise DamagedBlockError(f"a chunk has the unknown compression {compression!r}")
+    except (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError, MemoryError) as error:
+        raise DamagedBlockError(f"a {compression} chunk cannot be unpacked ({error})") from error
+    if len(found) != size and not torn:
+        raise DamagedBlockError(f"a {compression} chunk states {size} bytes and holds {len(found)}")
+    return memoryview(found)
+
+
+def text(raw: Buffer) -> str:
+    """Decode UTF-8; bytes that are not UTF-8 come out as backslash escapes."""
+    return bytes(raw).decode("utf-8", "backslashreplace")

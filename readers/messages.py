@@ -1,0 +1,423 @@
+"""Message → sample, one function for each type of message.
+
+Each function takes the decoded message, an object with attributes, and its `Arrival`. The same function
+serves a type in ROS 1, ROS 2, JSON and protobuf: field names differ only in the time stamps and in the case
+of the calibration matrices. Quaternions are x, y, z, w; everything comes out in SI units and radians.
+"""
+
+from __future__ import annotations
+
+import base64
+import binascii
+import math
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, field, replace
+from typing import Any, NamedTuple, TypedDict
+
+import numpy as np
+
+from readers.clock import sane_stamp
+from readers.decoding import MessageError
+from readers.streams import (
+    UNKNOWN_COV3,
+    UNKNOWN_COV6,
+    UNKNOWN_QUAT,
+    UNKNOWN_VEC3,
+    Camera,
+    CameraInfo,
+    FloatArray,
+    GnssSample,
+    ImageSample,
+    ImuSample,
+    OdometrySample,
+    PoseSample,
+    RangeSample,
+    Sample,
+    ScalarSample,
+    StreamKind,
+    array,
+)
+
+SIGNATURES = {
+    b"\xff\xd8\xff": "jpeg",
+    b"\x89PNG\r\n\x1a\n": "png",
+    b"II*\0": "tiff",
+    b"MM\0*": "tiff",
+    b"BM": "bmp",
+    b"\0\0\0\x0cjP": "jp2",
+}
+
+
+class UnsupportedError(MessageError):
+    """A kind of message that is refused by name, as all messages of its stream are."""
+
+
+class Stamps(TypedDict):
+    """The fields that every sample has."""
+
+    stream: str
+    t_ns: int
+    received_ns: int
+    oddities: tuple[str, ...]
+
+
+@dataclass(slots=True)
+class Arrival:
+    """Where and when a message came: the stream, the log time, and whether its own stamps are a clock."""
+
+    stream: str
+    received_ns: int
+    trust_stamps: bool = True
+    oddities: list[str] = field(default_factory=list)
+
+    @property
+    def source(self) -> str:
+        """The message, for people to find it again."""
+        return f"{self.stream}, logged at {self.received_ns} ns"
+
+    def stamps(self, stamp: Any = None) -> Stamps:
+        """The times of the sample: its own stamp where that is sane, else the log time, which is noted.
+
+        Call it last: it takes the oddities found so far with it.
+        """
+        t_ns = self.received_ns
+        if stamp is not None:
+            own_ns = stamp_ns(stamp)
+            if not sane_stamp(own_ns, self.received_ns):
+                self.oddities.append("foreign_stamp")
+            elif not self.trust_stamps:
+                self.oddities.append("frozen_stamp")
+            else:
+                t_ns = own_ns
+        return Stamps(stream=self.stream, t_ns=t_ns, received_ns=self.received_ns, oddities=tuple(self.oddities))
+
+
+def stamp_ns(stamp: Any) -> int:
+    """Nanoseconds of a time stamp of ROS 1, ROS 2, Foxglove JSON or protobuf."""
+    for seconds, nanoseconds in (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"), ("secs", "nsecs")):
+        if hasattr(stamp, seconds) and hasattr(stamp, nanoseconds):
+            return int(getattr(stamp, seconds)) * 1_000_000_000 + int(getattr(stamp, nanoseconds))
+    raise MessageError("the time stamp has no seconds and nanoseconds")
+
+
+def header_stamp(message: Any) -> Any:
+    """The stamp that a message carries itself, None if its type has none."""
+    header = getattr(message, "header", None)
+    return header.stamp if header is not None else getattr(message, "timestamp", None)
+
+
+def frame_of(message: Any) -> str:
+    """Name of the frame that the message is in, without a leading slash, "" if it names none."""
+    holder = getattr(message, "header", message)
+    return plain_frame(getattr(holder, "frame_id", ""))
+
+
+def plain_frame(name: Any) -> str:
+    """A frame's name without the leading slash of old tf."""
+    return str(name).lstrip("/")
+
+
+# ------------------------------------------------------------------------------ small parts
+
+
+def _vector(v: Any) -> FloatArray:
+    return array(v.x, v.y, v.z)
+
+
+def _quaternion(q: Any, arrival: Arrival) -> FloatArray:
+    """Orientation x, y, z, w; NaN for an all-zero one, scaled where it is not of unit norm. Both are noted."""
+    norm = math.hypot(q.x, q.y, q.z, q.w)
+    if norm == 0.0:
+        arrival.oddities.append("zero_quaternion")
+        return UNKNOWN_QUAT
+    if abs(norm - 1.0) > 1e-3:
+        arrival.oddities.append("quaternion_norm")
+        return array(q.x / norm, q.y / norm, q.z / norm, q.w / norm)
+    return array(q.x, q.y, q.z, q.w)
+
+
+def _matrix(values: Any, rows: int, columns: int) -> FloatArray:
+    """Row-major numbers as a matrix; NaN where the message has none."""
+    flat = np.array(values, dtype=np.float64).reshape(-1)
+    if flat.size == 0:
+        flat = np.full(rows * columns, np.nan)
+    if flat.size != rows * columns:
+        raise MessageError(f"a {rows} x {columns} matrix has {flat.size} numbers")
+    flat.setflags(write=False)
+    return flat.reshape(rows, columns)
+
+
+def _covariance6(values: Any) -> FloatArray:
+    """A 6 x 6 covariance; ROS writes an unknown one as zeros."""
+    return _matrix(values, 6, 6) if np.any(values) else UNKNOWN_COV6
+
+
+def _bytes(data: Any) -> bytes | memoryview:
+    """The bytes of a field: as they lie in the message where possible, decoded from base64 in JSON."""
+    if isinstance(data, str):
+        try:
+            return base64.b64decode(data, validate=True)
+        except binascii.Error as error:
+            raise MessageError(f"the image data are no base64 ({error})") from error
+    if isinstance(data, np.ndarray):
+        return data.data.cast("B") if data.size else b""
+    return bytes(data)
+
+
+# ----------------------------------------------------------------------------------- images
+
+
+def image(message: Any, arrival: Arrival) -> ImageSample:
+    """sensor_msgs/Image and foxglove.RawImage: the pixels stay where they are in the message."""
+    payload = _bytes(message.data)
+    height, step = int(message.height), int(message.step)
+    if height * step > len(payload):
+        raise MessageError(f"the image states {height} rows of {step} bytes and holds {len(payload)} bytes")
+    return ImageSample(
+        **arrival.stamps(header_stamp(message)),
+        encoding=str(message.encoding),
+        payload=payload,
+        width_px=int(message.width),
+        height_px=height,
+        step_bytes=step,
+        big_endian=bool(getattr(message, "is_bigendian", False)),
+        source=arrival.source,
+    )
+
+
+def compressed_image(message: Any, arrival: Arrival) -> ImageSample:
+    """sensor_msgs/CompressedImage and foxglove.CompressedImage."""
+    if "compressedDepth" in message.format:
+        raise UnsupportedError(f"depth images of the format {message.format!r} (compressedDepth) are not supported")
+    payload = _bytes(message.data)
+    if not payload:
+        raise MessageError("the image holds no bytes")
+    return ImageSample(
+        **arrival.stamps(header_stamp(message)),
+        encoding=compressed_format(payload, message.format),
+        payload=payload,
+        source=arrival.source,
+    )
+
+
+def compressed_format(payload: bytes | memoryview, stated: str) -> str:
+    """Name of a compressed format, by the first bytes where they are known, else by what the message states.
+
+    ROS states ``jpeg``, ``png``, or a sentence such as ``rgb8; jpeg compressed bgr8``.
+    """
+    start = bytes(payload[:12])
+    for signature, name in SIGNATURES.items():
+        if start.startswith(signature):
+            return name
+    if start[:4] == b"RIFF" and start[8:12] == b"WEBP":
+        return "webp"
+    sentence = stated.rpartition(";")[2].split()
+    name = sentence[0].lower() if sentence else "unknown"
+    return {"jpg": "jpeg", "tif": "tiff"}.get(name, name)
+
+
+def camera_info(message: Any, arrival: Arrival) -> CameraInfo:
+    """sensor_msgs/CameraInfo and foxglove.CameraCalibration."""
+
+    def numbers(name: str) -> Any:
+        return getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
+
+    distortion = np.array(numbers("D"), dtype=np.float64).reshape(-1)
+    distortion.setflags(write=False)
+    camera = Camera(
+        width_px=int(message.width),
+        height_px=int(message.height),
+        matrix=_matrix(numbers("K"), 3, 3),
+        distortion_model=_distortion_model(message.distortion_model, distortion),
+        distortion=distortion,
+        rectification=_matrix(numbers("R"), 3, 3),
+        projection=_matrix(numbers("P"), 3, 4),
+        frame=frame_of(message),
+    )
+    return CameraInfo(**arrival.stamps(header_stamp(message)), camera=camera)
+
+
+def _distortion_model(stated: str, distortion: FloatArray) -> str:
+    if stated:
+        return stated
+    if not np.any(distortion):
+        return "none"
+    return "rational_polynomial" if distortion.size == 8 else "plumb_bob"
+
+
+# ----------------------------------------------------------------------------------- motion
+
+
+def imu(message: Any, arrival: Arrival) -> ImuSample:
+    """sensor_msgs/Imu; what a covariance that begins with -1 marks as not measured is NaN."""
+    unmeasured = [message.orientation_covariance[0], message.angular_velocity_covariance[0]]
+    unmeasured.append(message.linear_acceleration_covariance[0])
+    no_quat, no_rate, no_force = (value == -1.0 for value in unmeasured)
+    quat = UNKNOWN_QUAT if no_quat else _quaternion(message.orientation, arrival)
+    if quat[3] == 1.0 and not np.any(quat[:3]) and not np.any(message.orientation_covariance):
+        arrival.oddities.append("identity_orientation")
+    return ImuSample(
+        **arrival.stamps(message.header.stamp),
+        angular_velocity_radps=UNKNOWN_VEC3 if no_rate else _vector(message.angular_velocity),
+        linear_acceleration_mps2=UNKNOWN_VEC3 if no_force else _vector(message.linear_acceleration),
+        quat_xyzw=quat,
+    )
+
+
+def odometry(message: Any, arrival: Arrival) -> OdometrySample:
+    """nav_msgs/Odometry: twist in the child frame, pose in the header's frame."""
+    pose, twist = message.pose.pose, message.twist.twist
+    quat = _quaternion(pose.orientation, arrival)
+    return OdometrySample(
+        **arrival.stamps(message.header.stamp),
+        linear_velocity_mps=_vector(twist.linear),
+        angular_velocity_radps=_vector(twist.angular),
+        position_m=_vector(pose.position),
+        quat_xyzw=quat,
+    )
+
+
+def twist(message: Any, arrival: Arrival) -> OdometrySample:
+    """geometry_msgs/Twist (at its log time) and TwistStamped."""
+    velocity = message.twist if hasattr(message, "twist") else message
+    return OdometrySample(
+        **arrival.stamps(header_stamp(message)),
+        linear_velocity_mps=_vector(velocity.linear),
+        angular_velocity_radps=_vector(velocity.angular),
+        position_m=UNKNOWN_VEC3,
+        quat_xyzw=UNKNOWN_QUAT,
+    )
+
+
+def pose(message: Any, arrival: Arrival) -> PoseSample:
+    """geometry_msgs/PoseStamped, PoseWithCovarianceStamped and foxglove.PoseInFrame."""
+    inner, covariance = message.pose, UNKNOWN_COV6
+    if hasattr(inner, "covariance"):
+        inner, covariance = inner.pose, _covariance6(inner.covariance)
+    quat = _quaternion(inner.orientation, arrival)
+    return PoseSample(
+        **arrival.stamps(header_stamp(message)),
+        position_m=_vector(inner.position),
+        quat_xyzw=quat,
+        covariance=covariance,
+        parent_frame=frame_of(message),
+    )
+
+
+def transform(message: Any, arrival: Arrival) -> PoseSample:
+    """geometry_msgs/TransformStamped and foxglove.FrameTransform, as `parent_T_child`."""
+    inner = getattr(message, "transform", message)
+    parent = message.parent_frame_id if hasattr(message, "parent_frame_id") else message.header.frame_id
+    quat = _quaternion(inner.rotation, arrival)
+    return PoseSample(
+        **arrival.stamps(header_stamp(message)),
+        position_m=_vector(inner.translation),
+        quat_xyzw=quat,
+        covariance=UNKNOWN_COV6,
+        parent_frame=plain_frame(parent),
+        child_frame=plain_frame(message.child_frame_id),
+    )
+
+
+def transforms(message: Any, arrival: Arrival) -> list[PoseSample]:
+    """tf2_msgs/TFMessage, tf/tfMessage, foxglove.FrameTransform(s): each frame pair is a stream of its own."""
+    found = []
+    for part in message.transforms if hasattr(message, "transforms") else [message]:
+        single = transform(part, Arrival(arrival.stream, arrival.received_ns, arrival.trust_stamps))
+        stream = pair_stream(arrival.stream, single.parent_frame, single.child_frame)
+        found.append(replace(single, stream=stream))
+    return found
+
+
+def pair_stream(topic: str, parent: str, child: str) -> str:
+    """Name of the stream of one frame pair of a tf topic, such as ``/tf:odom->base_link``."""
+    return f"{topic}:{plain_frame(parent)}->{plain_frame(child)}"
+
+
+# ---------------------------------------------------------------------------------- scalars
+
+
+def fix(message: Any, arrival: Arrival) -> GnssSample:
+    """sensor_msgs/NavSatFix; degrees become radians."""
+    known = message.position_covariance_type != 0
+    return GnssSample(
+        **arrival.stamps(message.header.stamp),
+        latitude_rad=math.radians(message.latitude),
+        longitude_rad=math.radians(message.longitude),
+        altitude_m=float(message.altitude),
+        covariance_m2=_matrix(message.position_covariance, 3, 3) if known else UNKNOWN_COV3,
+        status=int(message.status.status),
+    )
+
+
+def distance(message: Any, arrival: Arrival) -> RangeSample:
+    """sensor_msgs/Range."""
+    return RangeSample(
+        **arrival.stamps(message.header.stamp),
+        range_m=float(message.range),
+        min_range_m=float(message.min_range),
+        max_range_m=float(message.max_range),
+        field_of_view_rad=float(message.field_of_view),
+    )
+
+
+def scalar(message: Any, arrival: Arrival) -> ScalarSample:
+    """std_msgs/Float64, at its log time."""
+    return ScalarSample(**arrival.stamps(), value=float(message.data))
+
+
+# --------------------------------------------------------------------------------- the table
+
+
+class Reader(NamedTuple):
+    """What the messages of a type become; `splits` where one message makes samples of several streams."""
+
+    kind: StreamKind
+    read: Callable[[Any, Arrival], Sample] | Callable[[Any, Arrival], list[PoseSample]]
+    splits: bool = False
+
+
+READERS = {
+    "sensor_msgs/Image": Reader(StreamKind.IMAGE, image),
+    "sensor_msgs/CompressedImage": Reader(StreamKind.IMAGE, compressed_image),
+    "sensor_msgs/CameraInfo": Reader(StreamKind.CAMERA, camera_info),
+    "sensor_msgs/Imu": Reader(StreamKind.IMU, imu),
+    "sensor_msgs/NavSatFix": Reader(StreamKind.GNSS, fix),
+    "sensor_msgs/Range": Reader(StreamKind.RANGE, distance),
+    "nav_msgs/Odometry": Reader(StreamKind.ODOMETRY, odometry),
+    "geometry_msgs/Twist": Reader(StreamKind.ODOMETRY, twist),
+    "geometry_msgs/TwistStamped": Reader(StreamKind.ODOMETRY, twist),
+    "geometry_msgs/PoseStamped": Reader(StreamKind.POSE, pose),
+    "geometry_msgs/PoseWithCovarianceStamped": Reader(StreamKind.POSE, pose),
+    "geometry_msgs/TransformStamped": Reader(StreamKind.POSE, transform),
+    "tf2_msgs/TFMessage": Reader(StreamKind.POSE, transforms, splits=True),
+    "tf/tfMessage": Reader(StreamKind.POSE, transforms, splits=True),
+    "std_msgs/Float64": Reader(StreamKind.SCALAR, scalar),
+    "foxglove/RawImage": Reader(StreamKind.IMAGE, image),
+    "foxglove/CompressedImage": Reader(StreamKind.IMAGE, compressed_image),
+    "foxglove/CameraCalibration": Reader(StreamKind.CAMERA, camera_info),
+    "foxglove/PoseInFrame": Reader(StreamKind.POSE, pose),
+    "foxglove/FrameTransform": Reader(StreamKind.POSE, transforms, splits=True),
+    "foxglove/FrameTransforms": Reader(StreamKind.POSE, transforms, splits=True),
+}
+
+
+def reader_of(type_name: str) -> Reader | None:
+    """The reader of a message type, by whichever of its names; None if there is none."""
+    name = type_name.replace("/msg/", "/").replace("foxglove_msgs/", "foxglove/")
+    return READERS.get(name.replace("foxglove.", "foxglove/"))
+
+
+def samples_of(reader: Reader, message: Any, arrival: Arrival) -> Iterable[Sample]:
+    """The samples of one decoded message.
+
+    Raises:
+        MessageError: a field is missing or holds what it must not.
+    """
+    try:
+        found = reader.read(message, arrival)
+    except AttributeError as error:
+        raise MessageError(f"a field of the message is missing ({error})") from error
+    except (TypeError, ValueError, OverflowError, LookupError) as error:
+        raise MessageError(f"a field of the message cannot be used ({error})") from error
+    return found if isinstance(found, list) else (found,)
