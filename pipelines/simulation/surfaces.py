@@ -182,6 +182,7 @@ def tiles(
     rng: np.random.Generator,
     *,
     joint_px: int = 4,
+    joint_grey: float = 70.0,
     metres_per_px: float = PAPER_METRES_PER_PX,
 ) -> Surface:
     """Paving of strictly equal tiles with dark joints: every tile looks like every other.
@@ -189,5 +190,5 @@ def tiles(
     `period_px` is the side of a tile with its joint. A shift by a whole tile cannot be seen.
     """
     tile = 150 + 14 * _smooth_noise(period_px, 1.2, rng)
-    tile[:joint_px], tile[:, :joint_px] = 70, 70
+    tile[:joint_px], tile[:, :joint_px] = joint_grey, joint_grey
     return surface_from_periodic(tile, metres_per_px=metres_per_px)
