@@ -4,8 +4,8 @@ A vehicle drives six tenths of a figure eight over gravel and crosses its own wa
 straight down from 20.02 cm (0.0782 cm per pixel) at 30 frames per second. Two things go wrong:
 
 - frames 60 to 84: the exposure jumps up by 35 % and back again;
-- frames 186 to 215: the image centre is over a grating, whose pattern repeats every 8 px, so that the
-  correlation has many equal peaks (the grating comes into view ten frames earlier and leaves it ten later).
+- frames 198 to 205: the image centre is over a steel grating, whose pattern repeats every 8 px, so that the
+  correlation has many equal peaks; it comes into view ten frames earlier and leaves it ten later.
 
 The reference pose, the camera's height and its intrinsics are recorded beside the images.
 
@@ -24,7 +24,7 @@ from workbench.writers import write_mcap
 
 TARGET = Path(__file__).with_name("demo.mcap")
 FRAMES, RATE_HZ, SPEED_MPS = 300, 30.0, 0.42
-SIDE_PX = (352, 264)
+SIDE_PX = (320, 240)
 JPEG_QUALITY = 75
 SEED = 20
 
@@ -33,8 +33,8 @@ def demo_mission() -> SimulatedMission:
     """The mission that the recording shows."""
     rng = np.random.default_rng(SEED)
     poses = drive(figure_eight(1.20, 0.38), FRAMES, speed_mps=SPEED_MPS, rate_hz=RATE_HZ, ramp_frames=20, rng=rng)
-    ground = gravel(1024, rng, radius_px=(4.0, 24.0), gradient_rms=5.5)
-    grating = Patch(tiles(8, rng, joint_px=2, joint_grey=100), 0.38, 0.76, -0.70, -0.02)
+    ground = gravel(640, rng)
+    grating = Patch(tiles(8, rng, joint_px=2, joint_grey=100), 0.50, 0.60, -0.70, -0.02)
     return SimulatedMission(
         ground,
         poses,

@@ -202,7 +202,7 @@ def test_the_built_in_recording_is_what_its_script_makes() -> None:
         assert np.abs(image.astype(int) - mission.frame(k)).mean() < 5  # the next frame is 15 to 27 away
     assert [(f.name, f.start, f.stop) for f in mission.faults] == [
         ("ExposureJump", 60, 85),
-        ("RepetitivePatch", 186, 216),
+        ("RepetitivePatch", 198, 206),
     ]
     for fault in mission.faults:
         assert f"frames {fault.start} to {fault.stop - 1}" in (DEMO / "make_demo.py").read_text()
