@@ -114,11 +114,11 @@ def gravel(
     size_px: int,
     rng: np.random.Generator,
     *,
-    radius_px: tuple[float, float] = (2.5, 16.0),
+    radius_px: tuple[float, float] = (2.5, 14.0),
     gradient_rms: float = 7.0,
     metres_per_px: float = PAPER_METRES_PER_PX,
 ) -> Surface:
-    """Gravel: ellipsoidal pebbles of random size, shade and pose, one on another, lit from the side.
+    """Gravel: grained ellipsoidal pebbles of random size, shade and pose, one on another, lit from the side.
 
     The texture is periodic with `size_px`. Radii follow a power law between the two `radius_px`; the
     contrast is set so that the gradient along an axis has `gradient_rms` grey levels per px, 7 being
@@ -129,7 +129,7 @@ def gravel(
     grey = 38 + 9 * _smooth_noise(size_px, 2.0, rng)
     for radius in _pebble_radii(size_px, smallest, largest, rng):
         _lay_pebble(grey, height, radius, rng)
-    grey += 4 * _smooth_noise(size_px, 0.7, rng) + 10 * _smooth_noise(size_px, 40.0, rng)
+    grey += 16 * _smooth_noise(size_px, 0.8, rng) + 10 * _smooth_noise(size_px, 40.0, rng)
     grey = scipy.ndimage.gaussian_filter(grey, 0.7, mode="wrap")
     gradient = (np.roll(grey, -1, axis=1) - np.roll(grey, 1, axis=1)) / 2
     scaled = 110 + (grey - grey.mean()) * gradient_rms / np.sqrt(np.mean(gradient**2))
@@ -182,6 +182,7 @@ def tiles(
     rng: np.random.Generator,
     *,
     joint_px: int = 4,
+    joint_grey: float = 70.0,
     metres_per_px: float = PAPER_METRES_PER_PX,
 ) -> Surface:
     """Paving of strictly equal tiles with dark joints: every tile looks like every other.
@@ -189,5 +190,5 @@ def tiles(
     `period_px` is the side of a tile with its joint. A shift by a whole tile cannot be seen.
     """
     tile = 150 + 14 * _smooth_noise(period_px, 1.2, rng)
-    tile[:joint_px], tile[:, :joint_px] = 70, 70
+    tile[:joint_px], tile[:, :joint_px] = joint_grey, joint_grey
     return surface_from_periodic(tile, metres_per_px=metres_per_px)
