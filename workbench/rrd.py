@@ -1,0 +1,718 @@
+"""Rerun recordings: the only module that writes and reads ``.rrd`` files.
+
+A mission has one file of what was measured (`SensorWriter`) and one per run of what was concluded
+(`RunWriter`); equal recording ids let one viewer show them together. Both write columns, close with a
+footer, keep about half a second in memory, and put nothing of the wall clock into the data.
+"""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+
+from pipelines.estimator import Step
+from pipelines.geometry import heading_of_quat
+from pipelines.verdict import Severity, Verdict
+from readers.streams import ImageError, ImageSample, PoseSample, RecordingError, WorkbenchError
+from workbench import trace
+from workbench.blueprints import Extent, blueprint_of, sensor_blueprint
+from workbench.schema import Archetype, Schema, schema_of
+
+APPLICATION = "estimator_workbench"
+IMAGE = "/camera/image"
+REFERENCE = "/world/reference"
+
+MAX_ROWS = 1024
+MAX_BYTES = 2 << 20
+MAX_AGE_S = 0.5
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_LEVELS = {Severity.FINE: "INFO", Severity.NOTICE: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
+_COLOURS = {"reference": 0x2ECC71FF, "raw": 0x9E9E9EFF, "corrected": 0x4FC3F7FF, "aligned": 0xCE93D8FF}
+
+
+# ---------------------------------------------------------------------------- one file
+
+
+class _File:
+    """One ``.rrd`` that is being written: an explicit stream of columns on both timelines."""
+
+    def __init__(self, path: Path, recording_id: str, blueprint: rr.blueprint.Blueprint) -> None:
+        self.path = path
+        self._rec = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
+        if not rr.is_enabled(self._rec):
+            raise WorkbenchError(f"{path}: Rerun is switched off by the environment; unset RERUN or set RERUN=on")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._rec.save(path, default_blueprint=blueprint)
+        except (OSError, RuntimeError) as error:
+            raise RecordingError(path, f"cannot be written ({error})", "choose another folder with -o") from error
+        self._rec.set_log_time_enabled(False)
+        self._rec.set_log_tick_enabled(False)
+        self.static("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+
+    def static(self, entity: str, *what: rr.AsComponents) -> None:
+        """Log what holds for the whole recording."""
+        self._rec.log(entity, *what, static=True, strict=True)
+
+    def send(self, entity: str, frames: Ints, t_ns: Ints, *columns: Iterable[Any]) -> None:
+        """Log rows of one entity at frames [n] and sensor times [n]."""
+        if len(frames):
+            times = [
+                rr.TimeColumn("frame", sequence=frames),
+                rr.TimeColumn("sensor_time", timestamp=np.asarray(t_ns, np.int64).view("datetime64[ns]")),
+            ]
+            self._rec.send_columns(entity, times, [c for group in columns for c in group], strict=True)
+
+    def flush(self) -> None:
+        """Hand everything to the operating system: a process killed after this loses nothing of it."""
+        self._rec.flush()
+
+    def blueprint(self, blueprint: rr.blueprint.Blueprint) -> None:
+        """Make this the view of the file."""
+        self._rec.send_blueprint(blueprint, make_active=True, make_default=True)
+
+    def close(self) -> None:
+        """Write the footer."""
+        self._rec.flush()
+        self._rec.disconnect()
+
+
+def _blobs(items: Sequence[Any]) -> pa.Array:
+    """Buffers of bytes as one Arrow array of blobs, copied once."""
+    parts = [np.frombuffer(item, np.uint8) for item in items]
+    offsets = np.cumsum([0, *map(len, parts)], dtype=np.int32)
+    kind = rr.components.BlobBatch._ARROW_DATATYPE
+    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(np.concatenate(parts)), type=kind)
+
+
+def _repeated(column: rr.ComponentColumnList, count: int) -> rr.ComponentColumnList:
+    """A column of one row, `count` times."""
+    repeated = []
+    for one in column:
+        values = one.component_batch.as_arrow_array().take(pa.array(np.zeros(count, np.int64)))
+        repeated.append(rr.ComponentColumn(one.component_descriptor(), _Arrow(values)))
+    return rr.ComponentColumnList(repeated)
+
+
+class _Arrow:
+    """An Arrow array where Rerun wants a batch."""
+
+    def __init__(self, values: pa.Array) -> None:
+        self._values = values
+
+    def as_arrow_array(self) -> pa.Array:
+        return self._values
+
+
+def _texts(events: Sequence[trace.Event]) -> rr.ComponentColumnList:
+    return rr.TextLog.columns(text=[e.text for e in events], level=[_LEVELS[e.severity] for e in events])
+
+
+def _flat(points: Floats) -> Floats:
+    """Points [n, 2] on the ground as [n, 3]."""
+    return np.column_stack([points, np.zeros(len(points))])
+
+
+def _document(text: str) -> rr.TextDocument:
+    return rr.TextDocument(text, media_type="text/markdown")
+
+
+class _Writer:
+    """What both writers share: the file, the age of the buffer, and an orderly end."""
+
+    def __init__(self, path: Path | str, recording_id: str, blueprint: rr.blueprint.Blueprint) -> None:
+        self._file = _File(Path(path), recording_id, blueprint)
+        self._sent = -np.inf
+        self._open = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace_back: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def flush(self) -> None:
+        """Write what is buffered."""
+        self._write()
+        self._file.flush()
+        self._sent = time.monotonic()
+
+    def close(self) -> None:
+        """Write what is buffered and the footer; a second call does nothing."""
+        if self._open:
+            self._open = False
+            self._write()
+            self._file.close()
+
+    def _flush_if(self, full: bool) -> None:
+        if full or time.monotonic() - self._sent > MAX_AGE_S:
+            self.flush()
+
+    def _write(self) -> None:
+        raise NotImplementedError
+
+
+# ----------------------------------------------------------------------------- sensors
+
+
+class SensorWriter(_Writer):
+    """Writes what was measured: the images as they were stored, the reference, facts of the recording.
+
+    Args:
+        path: the file to write.
+        recording_id: the mission's id, equal in all its files.
+        raw_images: whether images without a viewable stored form go in as PNG or as raw pixels.
+
+    Raises:
+        WorkbenchError: Rerun is switched off.
+        RecordingError: the file cannot be written.
+    """
+
+    def __init__(self, path: Path | str, *, recording_id: str, raw_images: Literal["png", "raw"] = "png") -> None:
+        super().__init__(path, recording_id, sensor_blueprint())
+        self._raw_images = raw_images
+        self._images: list[tuple[int, int, Any, str]] = []
+        self._pixels: list[tuple[int, int, NDArray[Any]]] = []
+        self._frames: list[tuple[int, int]] = []
+        self._bytes = 0
+        self._reference: tuple[Ints, Floats, Floats] | None = None
+        self._arrow_m = 1.0
+
+    def image(self, frame: int, sample: ImageSample) -> None:
+        """Log a frame's image; stored JPEG and PNG bytes pass through unaltered.
+
+        Raises:
+            ImageError: the image has to be decoded for the log and cannot be.
+        """
+        if sample.media_type is not None:
+            self._encoded(frame, sample.t_ns, sample.data, sample.media_type)
+        else:
+            pixels = sample.grey() if _is_grey(sample.encoding) else sample.colour()
+            if self._raw_images == "raw":
+                self._pixels.append((frame, sample.t_ns, pixels))
+                self._bytes += pixels.nbytes
+            else:
+                self._encoded(frame, sample.t_ns, _png(pixels, sample), "image/png")
+        self._frames.append((frame, sample.t_ns))
+        self._flush_if(self._bytes > MAX_BYTES or len(self._frames) >= MAX_ROWS)
+
+    def undecodable(self, frame: int, t_ns: int, reason: str) -> None:
+        """Log that a frame has no image, and why; the viewer then shows none."""
+        self._write()
+        at = np.array([frame]), np.array([t_ns])
+        self._file.send("/camera/problems", *at, rr.TextLog.columns(text=[reason], level=["ERROR"]))
+        self._file.send(IMAGE, *at, rr.Clear.columns(is_recursive=[False]))
+
+    def reference(self, poses: Sequence[PoseSample]) -> None:
+        """Log the reference: its path, its numbers, and from now on its pose at every image's time."""
+        ordered = sorted(poses, key=lambda pose: pose.t_ns)
+        if not ordered:
+            return
+        t_ns = np.array([pose.t_ns for pose in ordered], np.int64)
+        position = np.array([pose.position_m for pose in ordered], np.float64)
+        heading = np.array([heading_of_quat(pose.quat_xyzw) for pose in ordered])
+        self._reference = t_ns, position, np.unwrap(heading)
+        self._arrow_m = Extent.of(position[:, :2]).size_m * 0.04
+        path = rr.LineStrips3D([_flat(position[:, :2])], colors=_COLOURS["reference"], radii=rr.Radius.ui_points(1.5))
+        self._file.static(f"{REFERENCE}/path", path)
+        self._file.static(f"{REFERENCE}/pose", *_marker("reference"))
+        names = ["x [m]", "y [m]", "z [m]", "heading [rad]"]
+        self._file.static("/sensors/reference", rr.SeriesLines(names=names))
+        times = [rr.TimeColumn("sensor_time", timestamp=t_ns.view("datetime64[ns]"))]
+        values = rr.Scalars.columns(scalars=np.column_stack([position, heading]))
+        self._file._rec.send_columns("/sensors/reference", times, values, strict=True)
+
+    def facts(self, lines: Iterable[str]) -> None:
+        """Log facts of the recording, one Markdown line each."""
+        self._file.static("/recording/facts", _document("\n".join(f"- {line}" for line in lines)))
+
+    def _encoded(self, frame: int, t_ns: int, data: Any, media_type: str) -> None:
+        self._images.append((frame, t_ns, data, media_type))
+        self._bytes += len(data)
+
+    def _write(self) -> None:
+        if self._images:
+            frames, t_ns, data, media = zip(*self._images, strict=True)
+            blobs = rr.components.BlobBatch(_blobs(data))
+            columns = rr.EncodedImage.columns(blob=blobs, media_type=list(media))
+            self._file.send(IMAGE, np.array(frames), np.array(t_ns), columns)
+        for frame, when, pixels in self._pixels:
+            columns = rr.Image.columns(buffer=[pixels.tobytes()], format=[_format(pixels)])
+            self._file.send(IMAGE, np.array([frame]), np.array([when]), columns)
+        if self._frames and self._reference is not None:
+            self._write_reference(*np.array(self._frames, np.int64).T, *self._reference)
+        self._images, self._pixels, self._frames, self._bytes = [], [], [], 0
+
+    def _write_reference(self, frames: Ints, t_ns: Ints, at_ns: Ints, position: Floats, heading: Floats) -> None:
+        inside = (t_ns >= at_ns[0]) & (t_ns <= at_ns[-1])
+        frames, t_ns = frames[inside], t_ns[inside]
+        since, known = (t_ns - at_ns[0]).astype(float), (at_ns - at_ns[0]).astype(float)
+        x, y, alpha = (np.interp(since, known, values) for values in (position[:, 0], position[:, 1], heading))
+        points = _flat(np.column_stack([x, y]))
+        self._file.send(f"{REFERENCE}/pose", frames, t_ns, rr.Points3D.columns(positions=points))
+        vectors = _flat(self._arrow_m * np.column_stack([np.cos(alpha), np.sin(alpha)]))
+        good = np.isfinite(vectors).all(axis=1)
+        arrows = rr.Arrows3D.columns(vectors=vectors[good], origins=points[good])
+        self._file.send(f"{REFERENCE}/heading", frames[good], t_ns[good], arrows)
+
+
+def _is_grey(encoding: str) -> bool:
+    return encoding.lower().startswith(("mono", "8uc1", "16uc1"))
+
+
+def _png(pixels: NDArray[Any], sample: ImageSample) -> bytes:
+    bgr = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    good, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not good:
+        raise ImageError(f"{sample.source or sample.stream}: the image cannot be encoded as PNG")
+    return bytes(data)
+
+
+def _format(pixels: NDArray[Any]) -> rr.components.ImageFormat:
+    return rr.components.ImageFormat(
+        width=pixels.shape[1],
+        height=pixels.shape[0],
+        color_model="L" if pixels.ndim == 2 else "RGB",
+        channel_datatype="U8" if pixels.dtype == np.uint8 else "U16",
+    )
+
+
+def _marker(name: str) -> tuple[rr.AsComponents, ...]:
+    return (rr.Points3D.from_fields(colors=_COLOURS[name], radii=rr.Radius.ui_points(5)),)
+
+
+# -------------------------------------------------------------------------------- runs
+
+
+class RunWriter(_Writer):
+    """Writes what one run concluded: every field of its steps, overlays, trajectory, verdicts.
+
+    Args:
+        path: the file to write.
+        recording_id: the mission's id, equal in all its files.
+        run: name of the run, one part of an entity path.
+        estimator: name of the estimator, likewise.
+        step_type: class of the steps; it needs a schema.
+        settings_text: the settings as they are saved beside the result.
+
+    Raises:
+        WorkbenchError: Rerun is switched off, or the Step class has no schema.
+        RecordingError: the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        recording_id: str,
+        run: str,
+        estimator: str,
+        step_type: type[Step],
+        settings_text: str,
+    ) -> None:
+        self._schema = schema_of(step_type)
+        self._run, self._estimator = run, estimator
+        super().__init__(path, recording_id, blueprint_of(step_type, run, estimator))
+        self._root = f"/runs/{run}/{estimator}"
+        self._world = f"/world/runs/{run}"
+        self._steps: list[Step] = []
+        self._shape_of = trace.shape_of(self._schema)
+        self._shape: Any = None
+        self._changes = trace.Changes()
+        self._lanes: dict[Verdict, bool] = {}
+        self._path: list[tuple[Ints, Ints, Floats, Floats]] = []
+        self._arrangement: bytes | None = None
+        self._file.static(f"/runs/{run}/settings", rr.TextDocument(settings_text, media_type="text/plain"))
+        self._constants()
+        self._file.blueprint(blueprint_of(step_type, run, estimator))
+
+    def step(self, step: Step) -> None:
+        """Log one step."""
+        shape = self._shape_of(step)
+        if shape != self._shape:
+            self._write()
+            self._shape = shape
+            self._legends(step)
+        self._steps.append(step)
+        self._flush_if(len(self._steps) >= self._capacity)
+
+    def event(self, frame: int, t_ns: int, severity: Severity, text: str) -> None:
+        """Log something worth stepping to that no verdict says."""
+        columns = _texts([trace.Event(0, severity, text)])
+        self._file.send(f"{self._root}/events", np.array([frame]), np.array([t_ns]), columns)
+
+    def errors(self, frames: Ints, t_ns: Ints, values: Floats) -> None:
+        """Log the errors against the reference: x, y, distance (m), heading (rad) [n, 4] at frames and times [n]."""
+        self._file.static(
+            f"{self._root}/error", rr.SeriesLines(names=["x [m]", "y [m]", "distance [m]", "heading [rad]"])
+        )
+        columns = rr.Scalars.columns(scalars=np.asarray(values, np.float64))
+        self._file.send(f"{self._root}/error", np.asarray(frames, np.int64), np.asarray(t_ns, np.int64), columns)
+
+    def finish(self, summary: Mapping[str, str | float | int], aligned_path: Floats | None) -> None:
+        """Log what is known at the end: the summary, the whole path, and the path [n, 2] aligned with the reference."""
+        self.flush()
+        rows = "\n".join(f"| {key} | {_number(value)} |" for key, value in summary.items())
+        self._file.static(f"/runs/{self._run}/summary", _document(f"| | |\n|---|---|\n{rows}"))
+        if aligned_path is not None and len(aligned_path):
+            self._line("aligned", aligned_path)
+        if self._path:
+            frames, t_ns, raw, pose = (np.concatenate(column) for column in zip(*self._path, strict=True))
+            self._finish_path(frames, t_ns, raw, pose)
+
+    # ---- what is logged once
+
+    def _constants(self) -> None:
+        verdicts = list(Verdict)
+        names = [str(v.name) for v in [Verdict.OK, *verdicts]]
+        colours = [trace.SEVERITY_COLOURS[v.severity] for v in [Verdict.OK, *verdicts]]
+        lanes = rr.StateConfiguration(values=names, labels=names, colors=colours)
+        self._file.static(f"{self._root}/verdict", lanes)
+        thin, thick = rr.Radius.ui_points(0.75), rr.Radius.ui_points(1.25)
+        image = f"{IMAGE}/{self._run}"
+        self._file.static(f"{image}/fragments", rr.Boxes2D.from_fields(colors=0xFFFFFFFF, radii=thin))
+        self._file.static(f"{image}/search", rr.Boxes2D.from_fields(colors=0x4FC3F7FF, radii=thin))
+        self._file.static(f"{image}/matches", rr.Boxes2D.from_fields(radii=thick))
+        self._file.static(f"{image}/shifts", rr.Arrows2D.from_fields(radii=thick))
+        surface = f"{self._root}/{self._schema.entity('surface')}"
+        self._file.static(
+            surface,
+            rr.DepthImage.from_fields(
+                colormap="viridis", depth_range=(-0.5, 1.0), meter=1.0, magnification_filter="nearest"
+            ),
+        )
+        for name, colour, radius in (("second", 0xFF8A65FF, 3), ("first", 0xFF1744FF, 4)):
+            marks = rr.Points2D.from_fields(colors=colour, radii=rr.Radius.ui_points(radius))
+            self._file.static(f"{surface}/{name}", marks)
+        for name in ("raw", "corrected"):
+            self._file.static(f"{self._world}/{name}", rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
+        self._file.static(f"{self._world}/raw", rr.Points3D.from_fields(colors=_COLOURS["raw"]))
+        self._file.static(f"{self._world}/body", *_marker("corrected"))
+        self._file.static(
+            f"{self._world}/covariance",
+            rr.Ellipsoids3D.from_fields(colors=_COLOURS["corrected"], line_radii=rr.Radius.ui_points(1)),
+        )
+
+    def _legends(self, step: Step) -> None:
+        """Log the names of the series, which depend on the number of fragments."""
+        table = trace.columns(self._schema, [step])
+        for entity, values in trace.scalar_groups(self._schema, table):
+            names = self._schema.series_names(entity, values.shape[1])
+            self._file.static(f"{self._root}/{entity}", rr.SeriesLines(names=names))
+        labels = [str(k + 1) for k in range(table["fragment_px"].shape[1])]
+        self._file.static(f"{IMAGE}/{self._run}/fragments", rr.Boxes2D.from_fields(labels=labels))
+        bytes_a_step = table["surface"].nbytes + 4096
+        self._capacity = max(1, min(MAX_ROWS, MAX_BYTES // bytes_a_step))
+
+    # ---- what is logged with every step
+
+    def _write(self) -> None:
+        if not self._steps:
+            return
+        table = trace.columns(self._schema, self._steps)
+        self._steps = []
+        self._values(table)
+        self._surfaces(table)
+        self._overlays(table)
+        self._map(table)
+        self._verdicts(table)
+        texts = trace.numbers(table)
+        media = _repeated(rr.TextDocument.columns(media_type=["text/markdown"]), len(texts))
+        self._send("numbers", table, rr.TextDocument.columns(text=texts), media)
+
+    def _send(self, entity: str, table: trace.Columns, *columns: Iterable[Any]) -> None:
+        path = entity if entity.startswith("/") else f"{self._root}/{entity}"
+        self._file.send(path, table["frame"], table["t_ns"], *columns)
+
+    def _values(self, table: trace.Columns) -> None:
+        for entity, values in trace.scalar_groups(self._schema, table):
+            self._send(entity, table, rr.Scalars.columns(scalars=values))
+        for entity, rows in self._schema.of(Archetype.INTEGERS).items():
+            integers = {row.field: table[row.field] for row in rows}
+            self._send(entity, table, rr.DynamicArchetype.columns(Archetype.INTEGERS.value, components=integers))
+
+    def _surfaces(self, table: trace.Columns) -> None:
+        root = f"{self._root}/{self._schema.entity('surface')}"
+        for group in trace.mosaics(table):
+            frames, t_ns = table["frame"][group.rows], table["t_ns"][group.rows]
+            n, height, width = group.images.shape
+            blobs = _blobs(group.images.view(np.uint8).reshape(n, -1))
+            format_ = rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="F16")
+            self._file.send(
+                root, frames, t_ns,
+                rr.DepthImage.columns(buffer=rr.components.ImageBufferBatch(blobs)),
+                _repeated(rr.DepthImage.columns(format=[format_]), n),
+            )  # fmt: skip
+            for name, points in (("second", group.second), ("first", group.first)):
+                marks = trace.shapes(points, points)
+                columns = rr.Points2D.columns(positions=marks.points).partition(marks.counts)
+                self._file.send(f"{root}/{name}", frames, t_ns, columns)
+            if group.corners.tobytes() != self._arrangement:
+                self._arrangement = group.corners.tobytes()
+                labels = [str(k + 1) for k in range(len(group.corners))]
+                columns = rr.Points2D.columns(positions=group.corners + 1.5, labels=labels).partition([len(labels)])
+                self._file.send(f"{root}/labels", frames[:1], t_ns[:1], columns)
+
+    def _overlays(self, table: trace.Columns) -> None:
+        for name, drawn in trace.overlays(table).items():
+            colours = {} if drawn.colours is None else {"colors": drawn.colours}
+            columns = (
+                rr.Arrows2D.columns(origins=drawn.points, vectors=drawn.extents, **colours)
+                if name == "shifts"
+                else rr.Boxes2D.columns(centers=drawn.points, half_sizes=drawn.extents, **colours)
+            )
+            self._send(f"{IMAGE}/{self._run}/{name}", table, columns.partition(drawn.counts))
+
+    def _map(self, table: trace.Columns) -> None:
+        raw, pose = table["pose_raw"], table["pose"]
+        colours = trace.verdict_colours(table["verdict"])
+        at = _flat(pose[:, :2])
+        self._send(f"{self._world}/raw", table, rr.Points3D.columns(positions=_flat(raw[:, :2])))
+        self._send(f"{self._world}/corrected", table, rr.Points3D.columns(positions=at, colors=colours))
+        self._send(f"{self._world}/body", table, rr.Points3D.columns(positions=at))
+        half, angle = trace.ellipses(table["pose_covariance"])
+        turn = np.column_stack([np.zeros((len(at), 2)), np.sin(angle / 2), np.cos(angle / 2)])
+        columns = rr.Ellipsoids3D.columns(half_sizes=_flat(np.nan_to_num(half)), centers=at, quaternions=turn)
+        self._send(f"{self._world}/covariance", table, columns)
+        self._path.append((table["frame"], table["t_ns"], raw, pose))
+
+    def _verdicts(self, table: trace.Columns) -> None:
+        events, changes = self._changes.take(table)
+        self._log("events", table, events)
+        self._log("verdicts", table, trace.verdict_lines(table))
+        if not changes:
+            return
+        at = np.array([row for row, _, _ in changes])
+        frames, t_ns = table["frame"][at], table["t_ns"][at]
+        names = [str(verdict.name) for _, verdict, _ in changes]
+        self._file.send(f"{self._root}/verdict", frames, t_ns, rr.StateChange.columns(state=names))
+        for row, _, alarms in changes:
+            self._alarm_lanes(int(table["frame"][row]), int(table["t_ns"][row]), alarms)
+
+    def _alarm_lanes(self, frame: int, t_ns: int, alarms: Verdict) -> None:
+        """One lane for every alarm that ever rang."""
+        for flag in Verdict:
+            rings = flag in alarms
+            if rings == self._lanes.get(flag, False):
+                continue
+            entity = f"{self._root}/alarms/{flag.name}"
+            if flag not in self._lanes:
+                name, colour = str(flag.name), trace.SEVERITY_COLOURS[flag.severity]
+                self._file.static(entity, rr.StateConfiguration(values=[name], labels=[name], colors=[colour]))
+            self._lanes[flag] = rings
+            state = str(flag.name) if rings else ""
+            self._file.send(entity, np.array([frame]), np.array([t_ns]), rr.StateChange.columns(state=[state]))
+
+    def _log(self, entity: str, table: trace.Columns, events: Sequence[trace.Event]) -> None:
+        if events:
+            at = np.array([event.row for event in events])
+            self._file.send(f"{self._root}/{entity}", table["frame"][at], table["t_ns"][at], _texts(events))
+
+    # ---- what is logged at the end
+
+    def _line(self, name: str, points: Floats) -> None:
+        finite = points[np.isfinite(points).all(axis=1)]
+        line = rr.LineStrips3D([_flat(finite)], colors=_COLOURS[name], radii=rr.Radius.ui_points(1.0))
+        self._file.static(f"{self._world}/path/{name}", line)
+
+    def _finish_path(self, frames: Ints, t_ns: Ints, raw: Floats, pose: Floats) -> None:
+        self._line("raw", raw[:, :2])
+        self._line("corrected", pose[:, :2])
+        extent = Extent.of(pose[:, :2])
+        good = np.isfinite(pose).all(axis=1)
+        vectors = 0.04 * extent.size_m * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
+        arrows = rr.Arrows3D.columns(vectors=_flat(vectors[good]), origins=_flat(pose[good, :2]))
+        self._file.static(
+            f"{self._world}/heading",
+            rr.Arrows3D.from_fields(colors=_COLOURS["corrected"], radii=rr.Radius.ui_points(1.5)),
+        )
+        self._file.send(f"{self._world}/heading", frames[good], t_ns[good], arrows)
+        span = int(frames.min()), int(frames.max())
+        view = blueprint_of(self._schema.step_type, self._run, self._estimator, frames=span, extent=extent)
+        self._file.blueprint(view)
+
+
+def _number(value: str | float | int) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+# ----------------------------------------------------------------------------- reading
+
+
+def read_steps(path: Path | str, run: str, step_type: type[Step]) -> list[Step]:
+    """The Steps of a run, from a finished file or from what a killed process left.
+
+    Every number is exactly the one that was logged, surfaces within the step of float16.
+
+    Raises:
+        RecordingError: the file cannot be read, or holds no such run.
+    """
+    schema = schema_of(step_type)
+    chunks = list(_chunks(Path(path), f"/runs/{run}/**"))
+    root = _root(Path(path), run, schema, chunks)
+    entities = _Entities(chunks, root)
+    scalars = schema.of(Archetype.SCALARS)
+    first = next(iter(scalars))
+    frames, t_ns, _ = entities.rows(first, Archetype.SCALARS.value)
+    table: dict[str, Sequence[Any]] = {}
+    for row in schema.rows:
+        if row.archetype is Archetype.TIMELINE:
+            table[row.field] = {"frame": frames, "sensor_time": t_ns}[row.entity].tolist()
+    for entity, rows in scalars.items():
+        table |= _split(schema, rows, entities.rows(entity, Archetype.SCALARS.value)[2])
+    for entity, rows in schema.of(Archetype.INTEGERS).items():
+        for row in rows:
+            values = entities.rows(entity, f"{Archetype.INTEGERS.value}:{row.field}")[2]
+            table[row.field] = [int(value[0]) for value in values]
+    for entity, rows in schema.of(Archetype.SURFACES).items():
+        table[rows[0].field] = _surfaces(entities, entity, table)
+    return list(trace.rebuild(schema, table))
+
+
+def _split(schema: Schema, rows: Sequence[Any], values: Sequence[Floats]) -> dict[str, list[Any]]:
+    """The rows of a group of scalars as the values of its fields."""
+    table: dict[str, list[Any]] = {}
+    start = 0
+    for row in rows:
+        shape = schema.shape(row.field)
+        if any(isinstance(n, str) for n in shape):
+            fixed = [n for n in shape if isinstance(n, int)]
+            table[row.field] = [value.reshape(-1, *fixed) for value in values]
+        elif shape:
+            width = int(np.prod(shape))
+            table[row.field] = [value[start : start + width].reshape(shape) for value in values]
+            start += width
+        else:
+            table[row.field] = [value[start] for value in values]
+            start += 1
+    return table
+
+
+def _surfaces(entities: _Entities, entity: str, table: Mapping[str, Sequence[Any]]) -> list[NDArray[np.float32]]:
+    buffers = entities.rows(entity, Archetype.SURFACES.value)[2]
+    formats = entities.rows(entity, "DepthImage:format")[2]
+    surfaces = []
+    sides = table["fragment_side_px"]
+    for buffer, format_, px, side in zip(buffers, formats, table["fragment_px"], sides, strict=True):
+        image = buffer.view(np.float16).reshape(format_[0]["height"], format_[0]["width"])
+        surfaces.append(trace.unmosaic(image, trace.cells(px, float(side))))
+    return surfaces
+
+
+class _Entities:
+    """The temporal chunks of a run, by entity, in the order of the frames."""
+
+    def __init__(self, chunks: Iterable[Any], root: str) -> None:
+        self._batches: dict[str, list[pa.RecordBatch]] = {}
+        for chunk in chunks:
+            if not chunk.is_static and chunk.entity_path.startswith(f"{root}/"):
+                entity = chunk.entity_path.removeprefix(f"{root}/")
+                self._batches.setdefault(entity, []).append(chunk.to_record_batch())
+
+    def rows(self, entity: str, component: str) -> tuple[Ints, Ints, list[Any]]:
+        """Frames [n], sensor times [n] and one array of values per row."""
+        frames, t_ns, values = [], [], []
+        for batch in self._batches.get(entity, []):
+            if component in batch.schema.names:
+                frames.append(batch.column("frame").to_numpy())
+                t_ns.append(batch.column("sensor_time").to_numpy().astype(np.int64))
+                values += _lists(batch.column(component))
+        if not frames:
+            return np.empty(0, np.int64), np.empty(0, np.int64), []
+        all_frames, all_t_ns = np.concatenate(frames), np.concatenate(t_ns)
+        order = np.argsort(all_frames, kind="stable")
+        return all_frames[order], all_t_ns[order], [values[i] for i in order]
+
+
+def _lists(column: pa.ListArray) -> list[Any]:
+    """The rows of an Arrow column of lists: numpy arrays of numbers, else Python lists."""
+    kind = column.type.value_type
+    if pa.types.is_list(kind):
+        column, kind = column.flatten(), kind.value_type
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+        return column.to_pylist()
+    bounds = np.cumsum([0, *column.value_lengths().to_pylist()])
+    flat = column.flatten().to_numpy(zero_copy_only=False)
+    return [flat[a:b] for a, b in zip(bounds, bounds[1:], strict=False)]
+
+
+def _root(path: Path, run: str, schema: Schema, chunks: Iterable[Any]) -> str:
+    """Where a run's fields lie: ``/runs/RUN/ESTIMATOR``."""
+    known = f"/{next(iter(schema.of(Archetype.SCALARS)))}"
+    for chunk in chunks:
+        parent = chunk.entity_path.removesuffix(known)
+        if parent != chunk.entity_path and parent.count("/") == 3:
+            return str(parent)
+    raise RecordingError(path, f"holds no steps of a run named {run!r}", "name one of the runs in the file's folder")
+
+
+def _chunks(path: Path, content: str) -> Iterator[Any]:
+    """The chunks of some entities, also of a file without a footer or with a torn end."""
+    if not path.is_file():
+        raise RecordingError(path, "there is no such file", "give the path of an .rrd file")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            yield from _stream(path).filter(content=content, is_static=False)
+        except RuntimeError:
+            with tempfile.TemporaryDirectory() as folder:
+                fixed = Path(folder) / "recovered.rrd"
+                recover(path, fixed)
+                yield from _stream(fixed).filter(content=content, is_static=False)
+
+
+def _stream(path: Path) -> Any:
+    reader = RrdReader(path)
+    try:
+        return reader.store().stream()
+    except RuntimeError:
+        return reader.stream()
+
+
+# ------------------------------------------------------------------------- whole files
+
+
+def merge(paths: Sequence[Path | str], out: Path | str) -> None:
+    """Join files of one mission into one portable file.
+
+    Raises:
+        RecordingError: a file cannot be read.
+    """
+    _tool(Path(paths[0]), "merge", *map(str, paths), "-o", str(out))
+
+
+def recover(path: Path | str, out: Path | str) -> None:
+    """Copy what is whole of an unfinished or torn file and write a footer.
+
+    Raises:
+        RecordingError: nothing can be read.
+    """
+    _tool(Path(path), "filter", str(path), "-o", str(out), "--continue-on-error")
+
+
+def _tool(path: Path, *arguments: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", *arguments], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+        raise RecordingError(path, f"cannot be read as a Rerun recording ({reason})", "give a file that a replay wrote")

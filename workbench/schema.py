@@ -1,0 +1,203 @@
+"""Where each field of a Step lies in the recording: its entity, its archetype and its series.
+
+An entity path here is relative to the root of a run, ``/runs/RUN/ESTIMATOR``. Unit, shape and meaning
+are those that the Step declares (`pipelines.estimator.quantities`) and are not repeated here. Fields
+that share an entity form one group of series, in the order of the rows; a field whose length the
+settings decide (a letter in its shape) has its entity to itself. `docs/schema.md` is made from this.
+"""
+
+from __future__ import annotations
+
+import enum
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from pipelines.correlation.step import CorrelationStep
+from pipelines.estimator import Step, quantities
+from readers.streams import WorkbenchError
+
+
+class Archetype(enum.StrEnum):
+    """How a field is logged, and in which component its values stand."""
+
+    TIMELINE = "timeline"
+    SCALARS = "Scalars:scalars"
+    INTEGERS = "Integers"
+    SURFACES = "DepthImage:buffer"
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One field of a Step.
+
+    Args:
+        field: name of the field.
+        entity: entity path relative to the run's root; the timeline's name for `Archetype.TIMELINE`.
+        archetype: how it is logged.
+        title: short name in legends, the field's name if empty.
+        axes: names along the field's fixed axes, flattened.
+        also: where else it can be seen.
+    """
+
+    field: str
+    entity: str
+    archetype: Archetype = Archetype.SCALARS
+    title: str = ""
+    axes: tuple[str, ...] = ()
+    also: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class Schema:
+    """The rows of one Step class."""
+
+    step_type: type[Step]
+    rows: tuple[Row, ...]
+
+    def of(self, archetype: Archetype) -> dict[str, tuple[Row, ...]]:
+        """The rows of one archetype by entity, in order."""
+        groups: dict[str, tuple[Row, ...]] = {}
+        for row in self.rows:
+            if row.archetype is archetype:
+                groups[row.entity] = (*groups.get(row.entity, ()), row)
+        return groups
+
+    def entity(self, field: str) -> str:
+        """The entity of a field, relative to the run's root."""
+        return next(row.entity for row in self.rows if row.field == field)
+
+    def shape(self, field: str) -> tuple[int | str, ...]:
+        """The declared shape of a field; a letter stands for a length that the settings decide."""
+        return tuple(quantities(self.step_type)[field]["shape"])
+
+    def series_names(self, entity: str, width: int) -> list[str]:
+        """Legend of a scalar entity whose rows hold `width` numbers."""
+        names: list[str] = []
+        for row in self.of(Archetype.SCALARS)[entity]:
+            quantity = quantities(self.step_type)[row.field]
+            fixed = math.prod(n for n in quantity["shape"] if isinstance(n, int))
+            free = [n for n in quantity["shape"] if isinstance(n, str)]
+            axes = row.axes or tuple(str(i) for i in range(fixed)) if fixed > 1 else ("",)
+            units = _units(quantity["unit"], len(axes))
+            title = row.title or row.field
+            heads = [f"{title} {k + 1}" for k in range(width // fixed)] if free else [title]
+            names += [
+                f"{head} {axis}".rstrip() + unit for head in heads for axis, unit in zip(axes, units, strict=True)
+            ]
+        return names
+
+
+def _units(unit: str, count: int) -> list[str]:
+    """The unit of each of `count` axes in brackets; nothing where it is 1 or differs within a matrix."""
+    parts = unit.split(", ")
+    parts = parts * count if len(parts) == 1 else parts
+    if len(parts) != count:
+        return [""] * count
+    return ["" if part == "1" else f" [{part}]" for part in parts]
+
+
+_UV = ("u", "v")
+_XY = ("x", "y")
+_HEADING = ("x", "y", "heading")
+_H2 = ("uu", "uv", "vu", "vv")
+_P3 = ("xx", "xy", "xα", "yx", "yy", "yα", "αx", "αy", "αα")
+_TABLE = "table in `numbers`"
+
+CORRELATION = Schema(
+    CorrelationStep,
+    (
+        Row("frame", "frame", Archetype.TIMELINE),
+        Row("t_ns", "sensor_time", Archetype.TIMELINE),
+        Row("received_ns", "received", Archetype.INTEGERS),
+        Row("verdict", "outcome", also="state lane `verdict`; `events` where it changes; `verdicts` for every frame"),
+        Row("alarms", "outcome", also="state lanes `alarms/NAME`"),
+        Row("accepted", "outcome"),
+        Row("template_frame", "outcome", title="template frame"),
+        Row("dt_s", "conditions", title="dt"),
+        Row("image_size_px", "conditions", title="image", axes=("width", "height")),
+        Row("fragment_side_px", "conditions", title="fragment side", also="size of the boxes on the image"),
+        Row("search_radius_px", "conditions", title="search radius", also="size of the boxes on the image"),
+        Row("rotation_limit_rad", "conditions", title="rotation limit"),
+        Row("metres_per_px", "conditions", title="W"),
+        Row("height_m", "conditions", title="height"),
+        Row("mean_grey", "image/grey", title="mean grey"),
+        Row("gradient_energy", "image/gradient_energy", title="gradient energy"),
+        Row("fragment_px", "search/fragment", axes=_UV, title="fragment", also="boxes on the image"),
+        Row("predicted_shift_px", "search/predicted_shift", axes=_UV, title="predicted"),
+        Row("search_centre_px", "search/centre", axes=_UV, title="centre", also="boxes on the image"),
+        Row("surface", "search/surface", Archetype.SURFACES, also="fragments arranged as on the image, float16"),
+        Row("peak_px", "search/peak", axes=_UV, title="peak", also="points on the surfaces"),
+        Row("peak_correlation", "search/peak_correlation", title="peak", also=_TABLE),
+        Row("second_peak_px", "search/second_peak", axes=_UV, title="second peak", also="points on the surfaces"),
+        Row("second_peak_correlation", "search/second_peak_correlation", title="second peak"),
+        Row("peak_ratio", "search/peak_ratio", title="ratio", also=_TABLE),
+        Row("peak_curvature", "search/peak_curvature", title="curvature"),
+        Row("peak_anisotropy", "search/peak_anisotropy", title="anisotropy"),
+        Row("delta_px", "subpixel/delta", axes=_UV, title="Δ", also=_TABLE),
+        Row("hessian", "subpixel/hessian", axes=_H2, title="H", also=_TABLE),
+        Row("condition", "subpixel/condition", title="condition", also=_TABLE),
+        Row("smallest_eigenvalue", "subpixel/smallest_eigenvalue", title="λ min"),
+        Row("iterations", "subpixel/iterations", title="iterations"),
+        Row("gain", "subpixel/gain", title="gain"),
+        Row("offset", "subpixel/offset", title="offset"),
+        Row("residual_rms", "subpixel/residual_rms", title="residual", also=_TABLE),
+        Row("sigma_px", "subpixel/sigma", axes=_UV, title="σ"),
+        Row("shift_px", "subpixel/shift", axes=_UV, title="shift", also="arrows and boxes on the image"),
+        Row("weight", "fit/weight", title="weight", also=f"colour of the boxes on the image; {_TABLE}"),
+        Row("fit_residual_px", "fit/residual", axes=_UV, title="fit residual", also=_TABLE),
+        Row("inliers", "fit/inliers", title="inliers"),
+        Row("rigidity_px", "fit/rigidity", title="rigidity"),
+        Row("scale", "fit/scale", title="scale"),
+        Row("centre_shift_px", "fit/centre_shift", axes=_UV, title="from the template"),
+        Row("template_rotation_rad", "fit/rotation", title="from the template"),
+        Row("motion_covariance", "fit/covariance", axes=("uu", "uv", "uα", "vu", "vv", "vα", "αu", "αv", "αα"),
+            title="motion P", also=_TABLE),
+        Row("frame_shift_px", "motion/frame_shift", axes=_UV, title="since the frame before"),
+        Row("delta_heading_rad", "motion/delta_heading", title="Δα"),
+        Row("heading_rad", "motion/heading", title="α"),
+        Row("path_step_m", "motion/increment", title="S"),
+        Row("increment_m", "motion/increment", axes=_XY, title="Δ"),
+        Row("segment_frames", "correction/segment_frames", title="segment frames"),
+        Row("segment_sum_m", "correction/segment", title="S_Σ"),
+        Row("segment_reference_m", "correction/segment", title="S_etal"),
+        Row("relative_deviation", "correction/relative_deviation", title="ΔS_relate"),
+        Row("deviation_m", "correction/deviation", title="ΔS_Σ"),
+        Row("correction_m", "correction/applied", axes=_XY, title="correction"),
+        Row("correction_total_m", "correction/applied", axes=_XY, title="total"),
+        Row("pose_raw", "pose/raw", axes=_HEADING, title="raw", also="`/world/runs/RUN/raw`"),
+        Row("pose", "pose/corrected", axes=_HEADING, title="corrected", also="`/world/runs/RUN/corrected`"),
+        Row("pose_covariance", "pose/covariance", axes=_P3, title="pose P",
+            also=f"ellipse `/world/runs/RUN/covariance`; {_TABLE}"),
+    ),
+)  # fmt: skip
+
+SCHEMAS: Mapping[type[Step], Schema] = {CorrelationStep: CORRELATION}
+
+
+def schema_of(step_type: type[Step]) -> Schema:
+    """The schema of a Step class.
+
+    Raises:
+        WorkbenchError: the class has none.
+    """
+    if step_type not in SCHEMAS:
+        raise WorkbenchError(f"{step_type.__name__}: no schema for the recording; add its rows to workbench/schema.py")
+    return SCHEMAS[step_type]
+
+
+def markdown(schema: Schema) -> str:
+    """The table of `docs/schema.md` for one Step class."""
+    lines = [
+        "| Field | Entity | Component | Shape | Unit | Meaning | Also shown as |",
+        "|---|---|---|---|---|---|---|",
+    ]
+    declared = quantities(schema.step_type)
+    for row in schema.rows:
+        field = declared[row.field]
+        shape = " × ".join(str(n) for n in field["shape"]) or "–"
+        entity = f"timeline `{row.entity}`" if row.archetype is Archetype.TIMELINE else f"`{row.entity}`"
+        component = "" if row.archetype is Archetype.TIMELINE else f"`{row.archetype.value}`"
+        cells = (f"`{row.field}`", entity, component, shape, field["unit"], field["meaning"], row.also)
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
