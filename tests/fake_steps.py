@@ -175,10 +175,7 @@ def image(frame: int, surface: NDArray[np.uint8], encoding: str = "jpeg") -> Ima
     """What the camera saw at that frame, by rolling the texture."""
     u, v = (int(p / W) for p in path(frame)[:2])
     pixels = np.ascontiguousarray(np.roll(surface, (v, -u), (0, 1))[:SIZE, :SIZE])
-    if encoding == "mono8":
-        payload = pixels.tobytes()
-    else:
-        payload = cv2.imencode("." + encoding, pixels)[1].tobytes()
+    payload = pixels.tobytes() if encoding == "mono8" else cv2.imencode("." + encoding, pixels)[1].tobytes()
     return ImageSample(
         stream="/camera", t_ns=t_of(frame), received_ns=t_of(frame), encoding=encoding, payload=payload,
         width_px=SIZE, height_px=SIZE, step_bytes=SIZE,
@@ -198,6 +195,6 @@ def reference(count: int) -> list[PoseSample]:
                 position_m=array(x, y, 0.3),
                 quat_xyzw=array(0, 0, math.sin(heading / 2), math.cos(heading / 2)),
                 covariance=np.full((6, 6), np.nan),
-            )  # fmt: skip
+            )
         )
     return poses

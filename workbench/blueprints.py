@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -33,65 +34,53 @@ class Extent:
         x, y = (low + high) / 2
         return cls(float(x), float(y), float((high - low).max()) or 1.0)
 
-
-def sensor_blueprint() -> rrb.Blueprint:
-    """The view of a mission's sensors alone."""
-    return rrb.Blueprint(
-        rrb.Horizontal(
-            rrb.Spatial2DView(origin="/camera/image", name="Image"),
-            rrb.Vertical(
-                _map(None),
-                rrb.TextDocumentView(origin="/recording/facts", name="Recording"),
-                row_shares=[3, 2],
-            ),
-        ),
-        *_panels(),
-        auto_views=False,
-    )
+    def bar(self) -> tuple[float, tuple[float, float]]:
+        """A round length of at most a quarter of the side, and where a scale bar of it begins (x, y)."""
+        power = 10.0 ** math.floor(math.log10(self.size_m / 4))
+        length = next(n * power for n in (5, 2, 1) if n * power <= self.size_m / 4)
+        return length, (self.x_m - self.size_m / 2, self.y_m - 0.58 * self.size_m)
 
 
-def blueprint_of(
-    step_type: type[Step],
-    run: str,
-    estimator: str,
-    *,
-    frames: tuple[int, int] | None = None,
-    extent: Extent | None = None,
-) -> rrb.Blueprint:
-    """The view of a run of the estimator that makes these steps."""
-    if issubclass(step_type, CorrelationStep):
-        return correlation_blueprint(run, estimator, frames=frames, extent=extent)
-    raise KeyError(step_type.__name__)
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What a view is to show in full; the viewer chooses where something is None.
 
-
-def correlation_blueprint(
-    run: str,
-    estimator: str = "correlation",
-    *,
-    frames: tuple[int, int] | None = None,
-    extent: Extent | None = None,
-) -> rrb.Blueprint:
-    """Image, surfaces and map above; plots, tables and events below; verdicts at the foot.
-
-    Args:
-        run: name of the run.
-        estimator: name of the estimator.
-        frames: first and last frame, for the axes of the plots; all that there is if None.
-        extent: the square on the ground that the map shows; the viewer's choice if None.
+    Attributes:
+        frames: first and last frame, for the axes of the plots.
+        extent: the square on the ground, for the map.
+        image_px: width and height of the image.
+        surfaces_px: width and height of the mosaic of correlation surfaces.
     """
+
+    frames: tuple[int, int] | None = None
+    extent: Extent | None = None
+    image_px: tuple[float, float] | None = None
+    surfaces_px: tuple[float, float] | None = None
+
+
+def blueprint_of(step_type: type[Step], run: str, estimator: str, bounds: Bounds) -> rrb.Blueprint:
+    """The view of a run of the estimator that makes these steps; plain where there is none of its own."""
+    if issubclass(step_type, CorrelationStep):
+        return correlation_blueprint(run, estimator, bounds)
+    return rrb.Blueprint(*_panels(), auto_views=True, auto_layout=True)
+
+
+def correlation_blueprint(run: str, estimator: str = "correlation", bounds: Bounds | None = None) -> rrb.Blueprint:
+    """Image, surfaces and map above; plots, tables and events in the middle; verdicts at the foot."""
+    bounds = bounds or Bounds()
     root = f"/runs/{run}/{estimator}"
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
                 rrb.Spatial2DView(origin="/camera/image", contents=["/camera/image", f"/camera/image/{run}/**"],
-                                  name="Image: fragments, search areas, matches"),
-                rrb.Spatial2DView(origin=f"{root}/search/surface", name="Correlation surfaces"),
-                _map(run, extent),
+                                  name="Image: fragments, search areas, matches", visual_bounds=_bounds(bounds.image_px)),
+                rrb.Spatial2DView(origin=f"{root}/search/surface", name="Correlation surfaces", visual_bounds=_bounds(bounds.surfaces_px)),
+                _map(run, bounds.extent),
             ),
-            rrb.Horizontal(_plots(root, frames), _texts(run, root), column_shares=[2, 1]),
-            rrb.StateTimelineView(origin=root, contents=[f"{root}/verdict", f"{root}/alarms/**"], name="Verdicts",
-                                  time_view=_axis(frames)),
-            row_shares=[5, 4, 2],
+            rrb.Horizontal(_plots(root, bounds.frames), _texts(run, root), column_shares=[2, 1]),
+            rrb.StateTimelineView(origin=root, contents=[f"{root}/verdict", f"{root}/verdicts/**"], name="Verdicts",
+                                  time_view=_axis(bounds.frames)),
+            row_shares=[10, 8, 5],
         ),
         *_panels(),
         auto_views=False,
@@ -106,6 +95,12 @@ def _panels() -> Sequence[Any]:
     )
 
 
+def _bounds(size_px: tuple[float, float] | None) -> rrb.VisualBounds2D | None:
+    if size_px is None or not np.isfinite(size_px).all():
+        return None
+    return rrb.VisualBounds2D(x_range=(0.0, size_px[0]), y_range=(0.0, size_px[1]))
+
+
 def _axis(frames: tuple[int, int] | None) -> rrb.TimeAxis:
     first, last = (rr.TimeRangeBoundary.infinite(),) * 2 if frames is None else map(_absolute, frames)
     return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
@@ -115,12 +110,12 @@ def _absolute(frame: int) -> rr.TimeRangeBoundary:
     return rr.TimeRangeBoundary.absolute(seq=frame)
 
 
-def _map(run: str | None, extent: Extent | None = None) -> rrb.Spatial3DView:
+def _map(run: str, extent: Extent | None) -> rrb.Spatial3DView:
     """The ground from above: x to the right, y up."""
     eye = None
     if extent is not None:
         eye = rrb.EyeControls3D(
-            position=(extent.x_m, extent.y_m, 1.6 * extent.size_m),
+            position=(extent.x_m, extent.y_m, 1.3 * extent.size_m),
             look_target=(extent.x_m, extent.y_m, 0.0),
             eye_up=(0.0, 1.0, 0.0),
         )
@@ -130,11 +125,11 @@ def _map(run: str | None, extent: Extent | None = None) -> rrb.Spatial3DView:
             for name in ("frame", "sensor_time")
         ]
     )
-    overrides = {} if run is None else {f"/world/runs/{run}/{name}": trail for name in ("raw", "corrected")}
+    overrides: dict[Any, Any] = {f"/world/runs/{run}/{name}": trail for name in ("raw", "corrected")}
     return rrb.Spatial3DView(
         origin="/world",
         contents="/world/**",
-        name="Trajectory from above",
+        name="From above: reference green, raw grey, corrected blue",
         eye_controls=eye,
         overrides=overrides,
         background=[18, 20, 24],
@@ -142,47 +137,66 @@ def _map(run: str | None, extent: Extent | None = None) -> rrb.Spatial3DView:
 
 
 def _plots(root: str, frames: tuple[int, int] | None) -> rrb.Tabs:
-    def plot(name: str, *entities: str, hide: Mapping[str, Sequence[bool]] | None = None) -> rrb.TimeSeriesView:
-        overrides = {
-            f"{root}/{entity}": rr.SeriesLines.from_fields(visible_series=list(visible))
-            for entity, visible in (hide or {}).items()
-        }
+    def plot(name: str, entity: str, *, legend: bool = True, show: Sequence[bool] = ()) -> rrb.TimeSeriesView:
+        lines = rr.SeriesLines.from_fields(visible_series=list(show))
         return rrb.TimeSeriesView(
-            origin=root,
-            contents=[f"{root}/{entity}" for entity in entities],
+            origin=f"{root}/{entity}",
+            contents="$origin",
             name=name,
             axis_x=_axis(frames),
-            overrides=overrides,
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.RightTop),
+            overrides={f"{root}/{entity}": lines} if show else None,
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
         )
 
+    xy = [place in (0, 4) for place in range(9)]
+    heading = [place == 8 for place in range(9)]
     return rrb.Tabs(
-        plot("Shift", "motion/frame_shift", "fit/centre_shift"),
-        plot("Δ subpixel", "subpixel/delta"),
-        rrb.Vertical(plot("Δα", "motion/delta_heading"), plot("α", "motion/heading"), name="Δα, α"),
-        rrb.Grid(
-            plot("Correlation", "search/peak_correlation"),
-            plot("Peak ratio", "search/peak_ratio"),
-            plot("Residual", "subpixel/residual_rms"),
-            plot("Inliers", "fit/inliers"),
+        rrb.Horizontal(
+            plot("Shift since the frame before, px", "motion/frame_shift"),
+            plot("Shift from the template frame, px", "fit/centre_shift"),
+            name="Shift",
+        ),
+        rrb.Horizontal(
+            plot("Subpixel Δ of the fragments, px (u blue, v orange)", "subpixel/delta", legend=False),
+            plot("Left by the rigid fit, px (u blue, v orange)", "fit/residual", legend=False),
+            name="Δ",
+        ),
+        rrb.Horizontal(
+            plot("Δα since the frame before, rad", "motion/delta_heading", legend=False),
+            plot("Heading α, rad", "motion/heading", legend=False),
+            name="Δα, α",
+        ),
+        rrb.Horizontal(
+            plot("Peak correlation", "search/peak_correlation", legend=False),
+            plot("Second peak over first", "search/peak_ratio", legend=False),
+            plot("Residual rms, grey", "subpixel/residual_rms", legend=False),
+            plot("Inliers", "fit/inliers", legend=False),
             name="Quality",
         ),
-        plot("Correction", "correction/applied"),
-        rrb.Vertical(
-            plot("Error: x, y, distance", "error", hide={"error": [True, True, True, False]}),
-            plot("Error: heading", "error", hide={"error": [False, False, False, True]}),
+        rrb.Horizontal(
+            plot("Correction and its sum, m", "correction/applied"),
+            plot("Path of the segment and its reference, m", "correction/segment"),
+            name="Correction",
+        ),
+        rrb.Horizontal(
+            plot("Position error, m", "error", show=[True, True, True, False]),
+            plot("Heading error, rad", "error", legend=False, show=[False, False, False, True]),
             name="Errors",
         ),
-        plot("Covariance", "pose/covariance"),
-        name="Plots",
+        rrb.Horizontal(
+            plot("Variance of x (blue) and y, m²", "pose/covariance", legend=False, show=xy),
+            plot("Variance of the heading, rad²", "pose/covariance", legend=False, show=heading),
+            name="Covariance",
+        ),
     )
 
 
 def _texts(run: str, root: str) -> rrb.Tabs:
+    columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
     return rrb.Tabs(
         rrb.TextDocumentView(origin=f"{root}/numbers", name="Numbers"),
-        rrb.TextLogView(origin=f"{root}/events", name="Events"),
-        rrb.TextLogView(origin=f"{root}/verdicts", name="Every alarm"),
+        rrb.TextLogView(origin=f"{root}/events", name="Events", columns=columns),
+        rrb.TextLogView(origin=f"{root}/alarms", name="Every alarm", columns=columns),
         rrb.TextDocumentView(origin=f"/runs/{run}/summary", name="Summary"),
         rrb.TextDocumentView(origin=f"/runs/{run}/settings", name="Settings"),
         rrb.TextDocumentView(origin="/recording/facts", name="Recording"),

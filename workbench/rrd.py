@@ -7,6 +7,8 @@ footer, keep about half a second in memory, and put nothing of the wall clock in
 
 from __future__ import annotations
 
+import dataclasses
+import itertools
 import subprocess
 import sys
 import tempfile
@@ -29,7 +31,7 @@ from pipelines.geometry import heading_of_quat
 from pipelines.verdict import Severity, Verdict
 from readers.streams import ImageError, ImageSample, PoseSample, RecordingError, WorkbenchError
 from workbench import trace
-from workbench.blueprints import Extent, blueprint_of, sensor_blueprint
+from workbench.blueprints import Bounds, Extent, blueprint_of
 from workbench.schema import Archetype, Schema, schema_of
 
 APPLICATION = "estimator_workbench"
@@ -39,6 +41,8 @@ REFERENCE = "/world/reference"
 MAX_ROWS = 1024
 MAX_BYTES = 2 << 20
 MAX_AGE_S = 0.5
+ARROW_SHARE = 0.08
+"""Length of the arrows of heading, in sides of the map."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -53,14 +57,13 @@ _COLOURS = {"reference": 0x2ECC71FF, "raw": 0x9E9E9EFF, "corrected": 0x4FC3F7FF,
 class _File:
     """One ``.rrd`` that is being written: an explicit stream of columns on both timelines."""
 
-    def __init__(self, path: Path, recording_id: str, blueprint: rr.blueprint.Blueprint) -> None:
-        self.path = path
+    def __init__(self, path: Path, recording_id: str) -> None:
         self._rec = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
         if not rr.is_enabled(self._rec):
             raise WorkbenchError(f"{path}: Rerun is switched off by the environment; unset RERUN or set RERUN=on")
         try:
             path.parent.mkdir(parents=True, exist_ok=True)
-            self._rec.save(path, default_blueprint=blueprint)
+            self._rec.save(path)
         except (OSError, RuntimeError) as error:
             raise RecordingError(path, f"cannot be written ({error})", "choose another folder with -o") from error
         self._rec.set_log_time_enabled(False)
@@ -71,14 +74,22 @@ class _File:
         """Log what holds for the whole recording."""
         self._rec.log(entity, *what, static=True, strict=True)
 
-    def send(self, entity: str, frames: Ints, t_ns: Ints, *columns: Iterable[Any]) -> None:
-        """Log rows of one entity at frames [n] and sensor times [n]."""
-        if len(frames):
-            times = [
-                rr.TimeColumn("frame", sequence=frames),
-                rr.TimeColumn("sensor_time", timestamp=np.asarray(t_ns, np.int64).view("datetime64[ns]")),
-            ]
+    def send(self, entity: str, frames: Ints | None, t_ns: Ints, *columns: Iterable[Any]) -> None:
+        """Log rows of one entity at sensor times [n] and at frames [n], where they belong to frames."""
+        if len(t_ns):
+            times = [rr.TimeColumn("sensor_time", timestamp=np.asarray(t_ns, np.int64).view("datetime64[ns]"))]
+            if frames is not None:
+                times.append(rr.TimeColumn("frame", sequence=frames))
             self._rec.send_columns(entity, times, [c for group in columns for c in group], strict=True)
+
+    def scale_bar(self, extent: Extent) -> None:
+        """Draw a round length below the map."""
+        length, (x, y) = extent.bar()
+        line = rr.LineStrips3D(
+            [[(x, y, 0.0), (x + length, y, 0.0)]],
+            labels=[f"{length:g} m"], show_labels=True, colors=0xFFFFFFFF, radii=rr.Radius.ui_points(1.5),
+        )  # fmt: skip
+        self.static("/world/scale", line)
 
     def flush(self) -> None:
         """Hand everything to the operating system: a process killed after this loses nothing of it."""
@@ -137,8 +148,8 @@ def _document(text: str) -> rr.TextDocument:
 class _Writer:
     """What both writers share: the file, the age of the buffer, and an orderly end."""
 
-    def __init__(self, path: Path | str, recording_id: str, blueprint: rr.blueprint.Blueprint) -> None:
-        self._file = _File(Path(path), recording_id, blueprint)
+    def __init__(self, path: Path | str, recording_id: str) -> None:
+        self._file = _File(Path(path), recording_id)
         self._sent = -np.inf
         self._open = True
 
@@ -188,7 +199,7 @@ class SensorWriter(_Writer):
     """
 
     def __init__(self, path: Path | str, *, recording_id: str, raw_images: Literal["png", "raw"] = "png") -> None:
-        super().__init__(path, recording_id, sensor_blueprint())
+        super().__init__(path, recording_id)
         self._raw_images = raw_images
         self._images: list[tuple[int, int, Any, str]] = []
         self._pixels: list[tuple[int, int, NDArray[Any]]] = []
@@ -231,15 +242,16 @@ class SensorWriter(_Writer):
         position = np.array([pose.position_m for pose in ordered], np.float64)
         heading = np.array([heading_of_quat(pose.quat_xyzw) for pose in ordered])
         self._reference = t_ns, position, np.unwrap(heading)
-        self._arrow_m = Extent.of(position[:, :2]).size_m * 0.04
+        extent = Extent.of(position[:, :2])
+        self._arrow_m = extent.size_m * ARROW_SHARE
+        self._file.scale_bar(extent)
         path = rr.LineStrips3D([_flat(position[:, :2])], colors=_COLOURS["reference"], radii=rr.Radius.ui_points(1.5))
         self._file.static(f"{REFERENCE}/path", path)
         self._file.static(f"{REFERENCE}/pose", *_marker("reference"))
         names = ["x [m]", "y [m]", "z [m]", "heading [rad]"]
         self._file.static("/sensors/reference", rr.SeriesLines(names=names))
-        times = [rr.TimeColumn("sensor_time", timestamp=t_ns.view("datetime64[ns]"))]
         values = rr.Scalars.columns(scalars=np.column_stack([position, heading]))
-        self._file._rec.send_columns("/sensors/reference", times, values, strict=True)
+        self._file.send("/sensors/reference", None, t_ns, values)
 
     def facts(self, lines: Iterable[str]) -> None:
         """Log facts of the recording, one Markdown line each."""
@@ -313,6 +325,7 @@ class RunWriter(_Writer):
         estimator: name of the estimator, likewise.
         step_type: class of the steps; it needs a schema.
         settings_text: the settings as they are saved beside the result.
+        extent: what of the ground the map shows until the run's own path is known, such as the reference's.
 
     Raises:
         WorkbenchError: Rerun is switched off, or the Step class has no schema.
@@ -328,10 +341,11 @@ class RunWriter(_Writer):
         estimator: str,
         step_type: type[Step],
         settings_text: str,
+        extent: Extent | None = None,
     ) -> None:
         self._schema = schema_of(step_type)
         self._run, self._estimator = run, estimator
-        super().__init__(path, recording_id, blueprint_of(step_type, run, estimator))
+        super().__init__(path, recording_id)
         self._root = f"/runs/{run}/{estimator}"
         self._world = f"/world/runs/{run}"
         self._steps: list[Step] = []
@@ -343,7 +357,8 @@ class RunWriter(_Writer):
         self._arrangement: bytes | None = None
         self._file.static(f"/runs/{run}/settings", rr.TextDocument(settings_text, media_type="text/plain"))
         self._constants()
-        self._file.blueprint(blueprint_of(step_type, run, estimator))
+        self._bounds = Bounds(extent=extent)
+        self._view()
 
     def step(self, step: Step) -> None:
         """Log one step."""
@@ -389,10 +404,10 @@ class RunWriter(_Writer):
         self._file.static(f"{self._root}/verdict", lanes)
         thin, thick = rr.Radius.ui_points(0.75), rr.Radius.ui_points(1.25)
         image = f"{IMAGE}/{self._run}"
-        self._file.static(f"{image}/fragments", rr.Boxes2D.from_fields(colors=0xFFFFFFFF, radii=thin))
-        self._file.static(f"{image}/search", rr.Boxes2D.from_fields(colors=0x4FC3F7FF, radii=thin))
-        self._file.static(f"{image}/matches", rr.Boxes2D.from_fields(radii=thick))
-        self._file.static(f"{image}/shifts", rr.Arrows2D.from_fields(radii=thick))
+        self._file.static(f"{image}/fragments", rr.Boxes2D.from_fields(colors=0xFFFFFFB0, radii=thin, draw_order=11))
+        self._file.static(f"{image}/search", rr.Boxes2D.from_fields(colors=0x4FC3F7FF, radii=thin, draw_order=10))
+        self._file.static(f"{image}/matches", rr.Boxes2D.from_fields(radii=thick, draw_order=12))
+        self._file.static(f"{image}/shifts", rr.Arrows2D.from_fields(radii=thick, draw_order=13))
         surface = f"{self._root}/{self._schema.entity('surface')}"
         self._file.static(
             surface,
@@ -403,6 +418,8 @@ class RunWriter(_Writer):
         for name, colour, radius in (("second", 0xFF8A65FF, 3), ("first", 0xFF1744FF, 4)):
             marks = rr.Points2D.from_fields(colors=colour, radii=rr.Radius.ui_points(radius))
             self._file.static(f"{surface}/{name}", marks)
+        names = rr.Points2D.from_fields(colors=0xFFFFFFFF, radii=rr.Radius.ui_points(0), show_labels=True)
+        self._file.static(f"{surface}/labels", names)
         for name in ("raw", "corrected"):
             self._file.static(f"{self._world}/{name}", rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
         self._file.static(f"{self._world}/raw", rr.Points3D.from_fields(colors=_COLOURS["raw"]))
@@ -416,10 +433,15 @@ class RunWriter(_Writer):
         """Log the names of the series, which depend on the number of fragments."""
         table = trace.columns(self._schema, [step])
         for entity, values in trace.scalar_groups(self._schema, table):
-            names = self._schema.series_names(entity, values.shape[1])
-            self._file.static(f"{self._root}/{entity}", rr.SeriesLines(names=names))
+            names, colours = zip(*self._schema.series(entity, values.shape[1]), strict=True)
+            lines = rr.SeriesLines(names=names, colors=np.array(colours, np.uint32))
+            self._file.static(f"{self._root}/{entity}", lines)
         labels = [str(k + 1) for k in range(table["fragment_px"].shape[1])]
         self._file.static(f"{IMAGE}/{self._run}/fragments", rr.Boxes2D.from_fields(labels=labels))
+        group = next(trace.mosaics(table))
+        height, width = group.images.shape[1:]
+        image_px = tuple(table["image_size_px"][0].tolist())
+        self._view(image_px=image_px, surfaces_px=(float(width), float(height)))
         bytes_a_step = table["surface"].nbytes + 4096
         self._capacity = max(1, min(MAX_ROWS, MAX_BYTES // bytes_a_step))
 
@@ -484,7 +506,7 @@ class RunWriter(_Writer):
 
     def _map(self, table: trace.Columns) -> None:
         raw, pose = table["pose_raw"], table["pose"]
-        colours = trace.verdict_colours(table["verdict"])
+        colours = trace.verdict_colours(table["verdict"], _COLOURS["corrected"])
         at = _flat(pose[:, :2])
         self._send(f"{self._world}/raw", table, rr.Points3D.columns(positions=_flat(raw[:, :2])))
         self._send(f"{self._world}/corrected", table, rr.Points3D.columns(positions=at, colors=colours))
@@ -498,7 +520,7 @@ class RunWriter(_Writer):
     def _verdicts(self, table: trace.Columns) -> None:
         events, changes = self._changes.take(table)
         self._log("events", table, events)
-        self._log("verdicts", table, trace.verdict_lines(table))
+        self._log("alarms", table, trace.verdict_lines(table))
         if not changes:
             return
         at = np.array([row for row, _, _ in changes])
@@ -514,7 +536,7 @@ class RunWriter(_Writer):
             rings = flag in alarms
             if rings == self._lanes.get(flag, False):
                 continue
-            entity = f"{self._root}/alarms/{flag.name}"
+            entity = f"{self._root}/verdicts/{flag.name}"
             if flag not in self._lanes:
                 name, colour = str(flag.name), trace.SEVERITY_COLOURS[flag.severity]
                 self._file.static(entity, rr.StateConfiguration(values=[name], labels=[name], colors=[colour]))
@@ -539,16 +561,20 @@ class RunWriter(_Writer):
         self._line("corrected", pose[:, :2])
         extent = Extent.of(pose[:, :2])
         good = np.isfinite(pose).all(axis=1)
-        vectors = 0.04 * extent.size_m * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
+        self._file.scale_bar(extent)
+        vectors = ARROW_SHARE * extent.size_m * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
         arrows = rr.Arrows3D.columns(vectors=_flat(vectors[good]), origins=_flat(pose[good, :2]))
         self._file.static(
             f"{self._world}/heading",
-            rr.Arrows3D.from_fields(colors=_COLOURS["corrected"], radii=rr.Radius.ui_points(1.5)),
+            rr.Arrows3D.from_fields(colors=0xFFFFFFFF, radii=rr.Radius.ui_points(1.5)),
         )
         self._file.send(f"{self._world}/heading", frames[good], t_ns[good], arrows)
-        span = int(frames.min()), int(frames.max())
-        view = blueprint_of(self._schema.step_type, self._run, self._estimator, frames=span, extent=extent)
-        self._file.blueprint(view)
+        self._view(frames=(int(frames.min()), int(frames.max())), extent=extent)
+
+    def _view(self, **known: Any) -> None:
+        """Send the view again with what is known by now."""
+        self._bounds = dataclasses.replace(self._bounds, **known)
+        self._file.blueprint(blueprint_of(self._schema.step_type, self._run, self._estimator, self._bounds))
 
 
 def _number(value: str | float | int) -> str:
@@ -652,7 +678,7 @@ def _lists(column: pa.ListArray) -> list[Any]:
         return column.to_pylist()
     bounds = np.cumsum([0, *column.value_lengths().to_pylist()])
     flat = column.flatten().to_numpy(zero_copy_only=False)
-    return [flat[a:b] for a, b in zip(bounds, bounds[1:], strict=False)]
+    return [flat[a:b] for a, b in itertools.pairwise(bounds)]
 
 
 def _root(path: Path, run: str, schema: Schema, chunks: Iterable[Any]) -> str:

@@ -8,10 +8,12 @@ settings decide (a letter in its shape) has its entity to itself. `docs/schema.m
 
 from __future__ import annotations
 
+import colorsys
 import enum
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step, quantities
@@ -48,6 +50,13 @@ class Row:
     also: str = ""
 
 
+class Series(NamedTuple):
+    """One line of a plot: its name in legends, its colour as RGBA."""
+
+    name: str
+    colour: int
+
+
 @dataclass(frozen=True, slots=True)
 class Schema:
     """The rows of one Step class."""
@@ -71,21 +80,29 @@ class Schema:
         """The declared shape of a field; a letter stands for a length that the settings decide."""
         return tuple(quantities(self.step_type)[field]["shape"])
 
-    def series_names(self, entity: str, width: int) -> list[str]:
-        """Legend of a scalar entity whose rows hold `width` numbers."""
-        names: list[str] = []
+    def series(self, entity: str, width: int) -> list[Series]:
+        """The series of a scalar entity whose rows hold `width` numbers."""
+        found: list[Series] = []
         for row in self.of(Archetype.SCALARS)[entity]:
             quantity = quantities(self.step_type)[row.field]
             fixed = math.prod(n for n in quantity["shape"] if isinstance(n, int))
             free = [n for n in quantity["shape"] if isinstance(n, str)]
-            axes = row.axes or tuple(str(i) for i in range(fixed)) if fixed > 1 else ("",)
+            axes = row.axes or tuple(map(str, range(fixed))) if fixed > 1 else ("",)
             units = _units(quantity["unit"], len(axes))
             title = row.title or row.field
-            heads = [f"{title} {k + 1}" for k in range(width // fixed)] if free else [title]
-            names += [
-                f"{head} {axis}".rstrip() + unit for head in heads for axis, unit in zip(axes, units, strict=True)
-            ]
-        return names
+            for head in [f"{title} {k + 1}" for k in range(width // fixed)] if free else [title]:
+                for axis, unit in zip(axes, units, strict=True):
+                    name = f"{head} {axis}".rstrip() + unit
+                    found.append(Series(name, _colour(len(found), axes.index(axis), len(axes))))
+        return found
+
+
+def _colour(place: int, axis: int, axes: int) -> int:
+    """RGBA of a series: shades of blue and orange for the two axes of a plane, else a hue of its own."""
+    hue = (0.57, 0.08)[axis] if axes == 2 else 0.57 + place * 0.618
+    shade = 0.45 + 0.5 * ((place // 2 * 0.382) % 1) if axes == 2 else 0.6
+    rgb = colorsys.hsv_to_rgb(hue % 1, shade, 0.95)
+    return sum(int(c * 255) << shift for c, shift in zip(rgb, (24, 16, 8), strict=True)) | 0xFF
 
 
 def _units(unit: str, count: int) -> list[str]:
@@ -110,8 +127,8 @@ CORRELATION = Schema(
         Row("frame", "frame", Archetype.TIMELINE),
         Row("t_ns", "sensor_time", Archetype.TIMELINE),
         Row("received_ns", "received", Archetype.INTEGERS),
-        Row("verdict", "outcome", also="state lane `verdict`; `events` where it changes; `verdicts` for every frame"),
-        Row("alarms", "outcome", also="state lanes `alarms/NAME`"),
+        Row("verdict", "outcome", also="state lane `verdict`; `events` where it changes; points of the path"),
+        Row("alarms", "outcome", also="state lanes `verdicts/NAME`; lines of `alarms`"),
         Row("accepted", "outcome"),
         Row("template_frame", "outcome", title="template frame"),
         Row("dt_s", "conditions", title="dt"),

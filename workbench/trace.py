@@ -7,6 +7,7 @@ viewer, which puts the corner of the first pixel at (0, 0): half a pixel more th
 from __future__ import annotations
 
 import functools
+import itertools
 import operator
 import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
@@ -151,7 +152,7 @@ def mosaics(table: Columns) -> Iterator[Mosaics]:
         for px, side in zip(table["fragment_px"], table["fragment_side_px"], strict=True)
     ]
     bounds = [0, *(i for i in range(1, len(keys)) if keys[i] != keys[i - 1]), len(keys)]
-    for start, stop in zip(bounds, bounds[1:], strict=False):
+    for start, stop in itertools.pairwise(bounds):
         rows = slice(start, stop)
         at = np.array(keys[start], np.int64)
         surfaces = table["surface"][rows]
@@ -212,9 +213,10 @@ def overlays(table: Columns) -> dict[str, Shapes]:
 # --------------------------------------------------------------------------------- map
 
 
-def verdict_colours(verdicts: Ints) -> Colours:
-    """RGBA [n] by the severity of each step's verdict."""
-    return np.array([SEVERITY_COLOURS[Verdict(v).severity] for v in verdicts.tolist()], np.uint32)
+def verdict_colours(verdicts: Ints, usual: int) -> Colours:
+    """RGBA [n] by the severity of each step's verdict, `usual` where it is fine."""
+    colours = {**SEVERITY_COLOURS, Severity.FINE: usual}
+    return np.array([colours[Verdict(v).severity] for v in verdicts.tolist()], np.uint32)
 
 
 def ellipses(covariance: Floats, *, sigmas: float = 3.0) -> tuple[Floats, Floats]:
@@ -232,38 +234,35 @@ def ellipses(covariance: Floats, *, sigmas: float = 3.0) -> tuple[Floats, Floats
 
 
 def numbers(table: Columns) -> list[str]:
-    """Each correlation step's fragments and matrices as Markdown tables."""
+    """Each correlation step's matrices and fragments as Markdown tables."""
     n, f = table["peak_correlation"].shape
-    fragment = np.concatenate(
-        [
-            np.broadcast_to(np.arange(1, f + 1.0), (n, f))[..., None],
-            *(table[name][..., None] for name in ("peak_correlation", "peak_ratio")),
-            table["shift_px"],
-            table["delta_px"],
-            table["fit_residual_px"],
-            *(table[name][..., None] for name in ("residual_rms", "condition", "weight")),
-            table["hessian"].reshape(n, f, 4)[..., [0, 1, 3]],
-        ],
-        axis=2,
+    number = np.broadcast_to(np.arange(1, f + 1.0), (n, f))[..., None]
+    quality = [table[name][..., None] for name in ("peak_correlation", "peak_ratio", "residual_rms", "condition")]
+    h = table["hessian"].reshape(n, f, 4)[..., [0, 1, 3]]
+    parts = (
+        (np.concatenate([table["pose_covariance"], table["motion_covariance"]], axis=2), _MATRICES),
+        (np.concatenate([number, *quality, table["weight"][..., None]], axis=2), _QUALITY),
+        (np.concatenate([number, table["shift_px"], table["delta_px"], table["fit_residual_px"]], axis=2), _SHIFTS),
+        (np.concatenate([number, h], axis=2), _HESSIANS),
     )
-    head = "| # | peak | ratio | shift u | v | Δ u | Δ v | fit u | fit v | rms | cond | weight | H uu | uv | vv |\n"
-    line = (
-        "| %.0f | %.3f | %.2f | %.2f | %.2f | %.3f | %.3f | %.3f | %.3f | %.2f | %.2f | %.2f | %.3g | %.3g | %.3g |\n"
-    )
-    form = (
-        "**Fragments** (px, grey)\n\n"
-        + head + "|" + "---:|" * fragment.shape[2] + "\n" + line * f
-        + _matrix_form("Pose covariance P (m, m, rad)", ("x", "y", "α"))
-        + _matrix_form("Motion covariance (px, px, rad)", ("u", "v", "α"))
-    )  # fmt: skip
-    names = ("pose_covariance", "motion_covariance")
-    values = np.concatenate([fragment.reshape(n, -1), *(table[name].reshape(n, 9) for name in names)], axis=1)
+    form = "\n".join(head + line * rows.shape[1] for rows, (head, line) in parts)
+    values = np.concatenate([rows.reshape(n, -1) for rows, _ in parts], axis=1)
     return [form % tuple(row) for row in values.tolist()]
 
 
-def _matrix_form(title: str, axes: tuple[str, ...]) -> str:
-    head = f"\n**{title}**\n\n| | " + " | ".join(axes) + " |\n" + "|" + "---:|" * (len(axes) + 1) + "\n"
-    return head + "".join(f"| **{axis}** |" + " %.3e |" * len(axes) + "\n" for axis in axes)
+def _table_form(title: str, names: str, formats: str) -> tuple[str, str]:
+    """Head and line of a Markdown table."""
+    heads, cells = names.split(), formats.split()
+    head = f"**{title}**\n\n| {' | '.join(heads)} |\n|{'---:|' * len(heads)}\n"
+    return head, f"| {' | '.join(cells)} |\n"
+
+
+_MATRICES = _table_form(
+    "Covariance of the pose (x, y m; α rad) and of the motion (u, v px; α rad)", "P·x P·y P·α M·u M·v M·α", "%.2e " * 6
+)
+_QUALITY = _table_form("Fragments", "# peak ratio rms condition weight", "%.0f %.4f %.3f %.2f %.2f %.2f")
+_SHIFTS = _table_form("Shifts, px", "# u v Δu Δv fit·u fit·v", "%.0f" + " %.3f" * 6)
+_HESSIANS = _table_form("Hessians, grey²/px²", "# uu uv vv", "%.0f" + " %.4g" * 3)
 
 
 # ---------------------------------------------------------------------------- verdicts
