@@ -72,9 +72,9 @@ def correlation_blueprint(run: str, estimator: str = "correlation", bounds: Boun
     return rrb.Blueprint(
         rrb.Vertical(
             rrb.Horizontal(
-                rrb.Spatial2DView(origin="/camera/image", contents=["/camera/image", f"/camera/image/{run}/**"],
-                                  name="Image: fragments, search areas, matches", visual_bounds=_bounds(bounds.image_px)),
-                rrb.Spatial2DView(origin=f"{root}/search/surface", name="Correlation surfaces", visual_bounds=_bounds(bounds.surfaces_px)),
+                _image("/camera/image", bounds.image_px, "Image: fragments, search areas, matches",
+                       contents=["/camera/image", f"/camera/image/{run}/**"]),
+                _image(f"{root}/search/surface", bounds.surfaces_px, "Correlation surfaces"),
                 _map(run, bounds.extent),
             ),
             rrb.Horizontal(_plots(root, bounds.frames), _texts(run, root), column_shares=[2, 1]),
@@ -95,10 +95,13 @@ def _panels() -> Sequence[Any]:
     )
 
 
-def _bounds(size_px: tuple[float, float] | None) -> rrb.VisualBounds2D | None:
-    if size_px is None or not np.isfinite(size_px).all():
-        return None
-    return rrb.VisualBounds2D(x_range=(0.0, size_px[0]), y_range=(0.0, size_px[1]))
+def _image(
+    origin: str, size_px: tuple[float, float] | None, name: str, *, contents: Sequence[str] = ("$origin/**",)
+) -> rrb.Spatial2DView:
+    bounds = None
+    if size_px is not None and np.isfinite(size_px).all():
+        bounds = rrb.VisualBounds2D(x_range=(0.0, size_px[0]), y_range=(0.0, size_px[1]))
+    return rrb.Spatial2DView(origin=origin, contents=list(contents), name=name, visual_bounds=bounds)
 
 
 def _axis(frames: tuple[int, int] | None) -> rrb.TimeAxis:
@@ -139,12 +142,13 @@ def _map(run: str, extent: Extent | None) -> rrb.Spatial3DView:
 def _plots(root: str, frames: tuple[int, int] | None) -> rrb.Tabs:
     def plot(name: str, entity: str, *, legend: bool = True, show: Sequence[bool] = ()) -> rrb.TimeSeriesView:
         lines = rr.SeriesLines.from_fields(visible_series=list(show))
+        overrides: dict[Any, Any] = {f"{root}/{entity}": lines} if show else {}
         return rrb.TimeSeriesView(
             origin=f"{root}/{entity}",
             contents="$origin",
             name=name,
             axis_x=_axis(frames),
-            overrides={f"{root}/{entity}": lines} if show else None,
+            overrides=overrides,
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
         )
 

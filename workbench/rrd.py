@@ -8,7 +8,10 @@ footer, keep about half a second in memory, and put nothing of the wall clock in
 from __future__ import annotations
 
 import dataclasses
+import functools
+import hashlib
 import itertools
+import math
 import subprocess
 import sys
 import tempfile
@@ -30,9 +33,9 @@ from pipelines.estimator import Step
 from pipelines.geometry import heading_of_quat
 from pipelines.verdict import Severity, Verdict
 from readers.streams import ImageError, ImageSample, PoseSample, RecordingError, WorkbenchError
-from workbench import trace
+from workbench import traces
 from workbench.blueprints import Bounds, Extent, blueprint_of
-from workbench.schema import Archetype, Schema, schema_of
+from workbench.schema import Archetype, Row, Schema, schema_of
 
 APPLICATION = "estimator_workbench"
 IMAGE = "/camera/image"
@@ -105,7 +108,7 @@ class _File:
         self._rec.disconnect()
 
 
-def _blobs(items: Sequence[Any]) -> pa.Array:
+def _blobs(items: Sequence[Any]) -> Any:
     """Buffers of bytes as one Arrow array of blobs, copied once."""
     parts = [np.frombuffer(item, np.uint8) for item in items]
     offsets = np.cumsum([0, *map(len, parts)], dtype=np.int32)
@@ -132,13 +135,14 @@ class _Arrow:
         return self._values
 
 
-def _texts(events: Sequence[trace.Event]) -> rr.ComponentColumnList:
+def _texts(events: Sequence[traces.Event]) -> rr.ComponentColumnList:
     return rr.TextLog.columns(text=[e.text for e in events], level=[_LEVELS[e.severity] for e in events])
 
 
-def _flat(points: Floats) -> Floats:
-    """Points [n, 2] on the ground as [n, 3]."""
-    return np.column_stack([points, np.zeros(len(points))])
+def _flat(points: Floats) -> NDArray[np.float32]:
+    """Points [n, 2] on the ground as [n, 3] in the viewer's precision."""
+    with np.errstate(over="ignore"):
+        return np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
 
 
 def _document(text: str) -> rr.TextDocument:
@@ -157,7 +161,7 @@ class _Writer:
         return self
 
     def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace_back: TracebackType | None
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
         self.close()
 
@@ -264,14 +268,14 @@ class SensorWriter(_Writer):
     def _write(self) -> None:
         if self._images:
             frames, t_ns, data, media = zip(*self._images, strict=True)
-            blobs = rr.components.BlobBatch(_blobs(data))
-            columns = rr.EncodedImage.columns(blob=blobs, media_type=list(media))
+            columns = rr.EncodedImage.columns(blob=_blobs(data), media_type=list(media))
             self._file.send(IMAGE, np.array(frames), np.array(t_ns), columns)
         for frame, when, pixels in self._pixels:
             columns = rr.Image.columns(buffer=[pixels.tobytes()], format=[_format(pixels)])
             self._file.send(IMAGE, np.array([frame]), np.array([when]), columns)
         if self._frames and self._reference is not None:
-            self._write_reference(*np.array(self._frames, np.int64).T, *self._reference)
+            frames, t_ns = np.array(self._frames, np.int64).T
+            self._write_reference(frames, t_ns, *self._reference)
         self._images, self._pixels, self._frames, self._bytes = [], [], [], 0
 
     def _write_reference(self, frames: Ints, t_ns: Ints, at_ns: Ints, position: Floats, heading: Floats) -> None:
@@ -349,9 +353,9 @@ class RunWriter(_Writer):
         self._root = f"/runs/{run}/{estimator}"
         self._world = f"/world/runs/{run}"
         self._steps: list[Step] = []
-        self._shape_of = trace.shape_of(self._schema)
+        self._shape_of = traces.shape_of(self._schema)
         self._shape: Any = None
-        self._changes = trace.Changes()
+        self._changes = traces.Changes()
         self._lanes: dict[Verdict, bool] = {}
         self._path: list[tuple[Ints, Ints, Floats, Floats]] = []
         self._arrangement: bytes | None = None
@@ -372,7 +376,7 @@ class RunWriter(_Writer):
 
     def event(self, frame: int, t_ns: int, severity: Severity, text: str) -> None:
         """Log something worth stepping to that no verdict says."""
-        columns = _texts([trace.Event(0, severity, text)])
+        columns = _texts([traces.Event(0, severity, text)])
         self._file.send(f"{self._root}/events", np.array([frame]), np.array([t_ns]), columns)
 
     def errors(self, frames: Ints, t_ns: Ints, values: Floats) -> None:
@@ -399,7 +403,7 @@ class RunWriter(_Writer):
     def _constants(self) -> None:
         verdicts = list(Verdict)
         names = [str(v.name) for v in [Verdict.OK, *verdicts]]
-        colours = [trace.SEVERITY_COLOURS[v.severity] for v in [Verdict.OK, *verdicts]]
+        colours = [traces.SEVERITY_COLOURS[v.severity] for v in [Verdict.OK, *verdicts]]
         lanes = rr.StateConfiguration(values=names, labels=names, colors=colours)
         self._file.static(f"{self._root}/verdict", lanes)
         thin, thick = rr.Radius.ui_points(0.75), rr.Radius.ui_points(1.25)
@@ -418,8 +422,8 @@ class RunWriter(_Writer):
         for name, colour, radius in (("second", 0xFF8A65FF, 3), ("first", 0xFF1744FF, 4)):
             marks = rr.Points2D.from_fields(colors=colour, radii=rr.Radius.ui_points(radius))
             self._file.static(f"{surface}/{name}", marks)
-        names = rr.Points2D.from_fields(colors=0xFFFFFFFF, radii=rr.Radius.ui_points(0), show_labels=True)
-        self._file.static(f"{surface}/labels", names)
+        labels = rr.Points2D.from_fields(colors=0xFFFFFFFF, radii=rr.Radius.ui_points(0), show_labels=True)
+        self._file.static(f"{surface}/labels", labels)
         for name in ("raw", "corrected"):
             self._file.static(f"{self._world}/{name}", rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
         self._file.static(f"{self._world}/raw", rr.Points3D.from_fields(colors=_COLOURS["raw"]))
@@ -431,14 +435,14 @@ class RunWriter(_Writer):
 
     def _legends(self, step: Step) -> None:
         """Log the names of the series, which depend on the number of fragments."""
-        table = trace.columns(self._schema, [step])
-        for entity, values in trace.scalar_groups(self._schema, table):
+        table = traces.columns(self._schema, [step])
+        for entity, values in traces.scalar_groups(self._schema, table):
             names, colours = zip(*self._schema.series(entity, values.shape[1]), strict=True)
             lines = rr.SeriesLines(names=names, colors=np.array(colours, np.uint32))
             self._file.static(f"{self._root}/{entity}", lines)
         labels = [str(k + 1) for k in range(table["fragment_px"].shape[1])]
         self._file.static(f"{IMAGE}/{self._run}/fragments", rr.Boxes2D.from_fields(labels=labels))
-        group = next(trace.mosaics(table))
+        group = next(traces.mosaics(table))
         height, width = group.images.shape[1:]
         image_px = tuple(table["image_size_px"][0].tolist())
         self._view(image_px=image_px, surfaces_px=(float(width), float(height)))
@@ -450,42 +454,42 @@ class RunWriter(_Writer):
     def _write(self) -> None:
         if not self._steps:
             return
-        table = trace.columns(self._schema, self._steps)
+        table = traces.columns(self._schema, self._steps)
         self._steps = []
         self._values(table)
         self._surfaces(table)
         self._overlays(table)
         self._map(table)
         self._verdicts(table)
-        texts = trace.numbers(table)
+        texts = traces.numbers(table)
         media = _repeated(rr.TextDocument.columns(media_type=["text/markdown"]), len(texts))
         self._send("numbers", table, rr.TextDocument.columns(text=texts), media)
 
-    def _send(self, entity: str, table: trace.Columns, *columns: Iterable[Any]) -> None:
+    def _send(self, entity: str, table: traces.Columns, *columns: Iterable[Any]) -> None:
         path = entity if entity.startswith("/") else f"{self._root}/{entity}"
         self._file.send(path, table["frame"], table["t_ns"], *columns)
 
-    def _values(self, table: trace.Columns) -> None:
-        for entity, values in trace.scalar_groups(self._schema, table):
+    def _values(self, table: traces.Columns) -> None:
+        for entity, values in traces.scalar_groups(self._schema, table):
             self._send(entity, table, rr.Scalars.columns(scalars=values))
         for entity, rows in self._schema.of(Archetype.INTEGERS).items():
             integers = {row.field: table[row.field] for row in rows}
             self._send(entity, table, rr.DynamicArchetype.columns(Archetype.INTEGERS.value, components=integers))
 
-    def _surfaces(self, table: trace.Columns) -> None:
+    def _surfaces(self, table: traces.Columns) -> None:
         root = f"{self._root}/{self._schema.entity('surface')}"
-        for group in trace.mosaics(table):
+        for group in traces.mosaics(table):
             frames, t_ns = table["frame"][group.rows], table["t_ns"][group.rows]
             n, height, width = group.images.shape
-            blobs = _blobs(group.images.view(np.uint8).reshape(n, -1))
+            blobs = _blobs(list(group.images.view(np.uint8).reshape(n, -1)))
             format_ = rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="F16")
             self._file.send(
                 root, frames, t_ns,
-                rr.DepthImage.columns(buffer=rr.components.ImageBufferBatch(blobs)),
+                rr.DepthImage.columns(buffer=blobs),
                 _repeated(rr.DepthImage.columns(format=[format_]), n),
             )  # fmt: skip
             for name, points in (("second", group.second), ("first", group.first)):
-                marks = trace.shapes(points, points)
+                marks = traces.shapes(points, points)
                 columns = rr.Points2D.columns(positions=marks.points).partition(marks.counts)
                 self._file.send(f"{root}/{name}", frames, t_ns, columns)
             if group.corners.tobytes() != self._arrangement:
@@ -494,9 +498,9 @@ class RunWriter(_Writer):
                 columns = rr.Points2D.columns(positions=group.corners + 1.5, labels=labels).partition([len(labels)])
                 self._file.send(f"{root}/labels", frames[:1], t_ns[:1], columns)
 
-    def _overlays(self, table: trace.Columns) -> None:
-        for name, drawn in trace.overlays(table).items():
-            colours = {} if drawn.colours is None else {"colors": drawn.colours}
+    def _overlays(self, table: traces.Columns) -> None:
+        for name, drawn in traces.overlays(table).items():
+            colours: dict[str, Any] = {} if drawn.colours is None else {"colors": drawn.colours}
             columns = (
                 rr.Arrows2D.columns(origins=drawn.points, vectors=drawn.extents, **colours)
                 if name == "shifts"
@@ -504,23 +508,23 @@ class RunWriter(_Writer):
             )
             self._send(f"{IMAGE}/{self._run}/{name}", table, columns.partition(drawn.counts))
 
-    def _map(self, table: trace.Columns) -> None:
+    def _map(self, table: traces.Columns) -> None:
         raw, pose = table["pose_raw"], table["pose"]
-        colours = trace.verdict_colours(table["verdict"], _COLOURS["corrected"])
+        colours = traces.verdict_colours(table["verdict"], _COLOURS["corrected"])
         at = _flat(pose[:, :2])
         self._send(f"{self._world}/raw", table, rr.Points3D.columns(positions=_flat(raw[:, :2])))
         self._send(f"{self._world}/corrected", table, rr.Points3D.columns(positions=at, colors=colours))
         self._send(f"{self._world}/body", table, rr.Points3D.columns(positions=at))
-        half, angle = trace.ellipses(table["pose_covariance"])
+        half, angle = traces.ellipses(table["pose_covariance"])
         turn = np.column_stack([np.zeros((len(at), 2)), np.sin(angle / 2), np.cos(angle / 2)])
         columns = rr.Ellipsoids3D.columns(half_sizes=_flat(np.nan_to_num(half)), centers=at, quaternions=turn)
         self._send(f"{self._world}/covariance", table, columns)
         self._path.append((table["frame"], table["t_ns"], raw, pose))
 
-    def _verdicts(self, table: trace.Columns) -> None:
+    def _verdicts(self, table: traces.Columns) -> None:
         events, changes = self._changes.take(table)
         self._log("events", table, events)
-        self._log("alarms", table, trace.verdict_lines(table))
+        self._log("alarms", table, traces.verdict_lines(table))
         if not changes:
             return
         at = np.array([row for row, _, _ in changes])
@@ -538,13 +542,13 @@ class RunWriter(_Writer):
                 continue
             entity = f"{self._root}/verdicts/{flag.name}"
             if flag not in self._lanes:
-                name, colour = str(flag.name), trace.SEVERITY_COLOURS[flag.severity]
+                name, colour = str(flag.name), traces.SEVERITY_COLOURS[flag.severity]
                 self._file.static(entity, rr.StateConfiguration(values=[name], labels=[name], colors=[colour]))
             self._lanes[flag] = rings
             state = str(flag.name) if rings else ""
             self._file.send(entity, np.array([frame]), np.array([t_ns]), rr.StateChange.columns(state=[state]))
 
-    def _log(self, entity: str, table: trace.Columns, events: Sequence[trace.Event]) -> None:
+    def _log(self, entity: str, table: traces.Columns, events: Sequence[traces.Event]) -> None:
         if events:
             at = np.array([event.row for event in events])
             self._file.send(f"{self._root}/{entity}", table["frame"][at], table["t_ns"][at], _texts(events))
@@ -595,78 +599,85 @@ def read_steps(path: Path | str, run: str, step_type: type[Step]) -> list[Step]:
     schema = schema_of(step_type)
     chunks = list(_chunks(Path(path), f"/runs/{run}/**"))
     root = _root(Path(path), run, schema, chunks)
-    entities = _Entities(chunks, root)
-    scalars = schema.of(Archetype.SCALARS)
-    first = next(iter(scalars))
-    frames, t_ns, _ = entities.rows(first, Archetype.SCALARS.value)
+    rows = _whole_rows(chunks, root, schema)
+    frames, t_ns, _ = next(iter(rows.values()))
     table: dict[str, Sequence[Any]] = {}
     for row in schema.rows:
         if row.archetype is Archetype.TIMELINE:
             table[row.field] = {"frame": frames, "sensor_time": t_ns}[row.entity].tolist()
-    for entity, rows in scalars.items():
-        table |= _split(schema, rows, entities.rows(entity, Archetype.SCALARS.value)[2])
-    for entity, rows in schema.of(Archetype.INTEGERS).items():
-        for row in rows:
-            values = entities.rows(entity, f"{Archetype.INTEGERS.value}:{row.field}")[2]
-            table[row.field] = [int(value[0]) for value in values]
-    for entity, rows in schema.of(Archetype.SURFACES).items():
-        table[rows[0].field] = _surfaces(entities, entity, table)
-    return list(trace.rebuild(schema, table))
+        elif row.archetype is Archetype.INTEGERS:
+            table[row.field] = [int(value[0]) for value in rows[row.entity, row.component][2]]
+    for entity, group in schema.of(Archetype.SCALARS).items():
+        table |= _split(schema, group, rows[entity, group[0].component][2])
+    for entity, (row,) in schema.of(Archetype.SURFACES).items():
+        formats = rows[entity, _FORMAT][2]
+        table[row.field] = _surfaces(rows[entity, row.component][2], formats, table)
+    return list(traces.rebuild(schema, table))
 
 
-def _split(schema: Schema, rows: Sequence[Any], values: Sequence[Floats]) -> dict[str, list[Any]]:
+_FORMAT = "DepthImage:format"
+_Rows = tuple[Ints, Ints, list[Any]]
+
+
+def _whole_rows(chunks: Iterable[Any], root: str, schema: Schema) -> dict[tuple[str, str], _Rows]:
+    """Frames, sensor times and values of each component, in the order of the frames.
+
+    Frames that lack a component are left out: they stood at the torn end of a file.
+    """
+    wanted = {(row.entity, row.component) for row in schema.rows if row.component}
+    wanted |= {(entity, _FORMAT) for entity in schema.of(Archetype.SURFACES)}
+    parts: dict[tuple[str, str], list[_Rows]] = {key: [] for key in wanted}
+    for chunk in chunks:
+        entity = chunk.entity_path.removeprefix(f"{root}/")
+        batch = chunk.to_record_batch()
+        for component in batch.schema.names:
+            if (entity, component) in parts:
+                frames = batch.column("frame").to_numpy()
+                t_ns = batch.column("sensor_time").to_numpy().astype(np.int64)
+                parts[entity, component].append((frames, t_ns, _lists(batch.column(component))))
+    whole = functools.reduce(np.intersect1d, (_concatenated(part)[0] for part in parts.values()))
+    return {key: _only(whole, *_concatenated(part)) for key, part in parts.items()}
+
+
+def _concatenated(parts: Sequence[_Rows]) -> _Rows:
+    empty = np.empty(0, np.int64)
+    frames, t_ns = (np.concatenate([empty, *(part[i] for part in parts)]) for i in (0, 1))
+    return frames, t_ns, [value for part in parts for value in part[2]]
+
+
+def _only(whole: Ints, frames: Ints, t_ns: Ints, values: list[Any]) -> _Rows:
+    order = np.argsort(frames, kind="stable")
+    order = order[np.isin(frames[order], whole)]
+    return frames[order], t_ns[order], [values[i] for i in order]
+
+
+def _split(schema: Schema, rows: Sequence[Row], values: Sequence[Floats]) -> dict[str, list[Any]]:
     """The rows of a group of scalars as the values of its fields."""
     table: dict[str, list[Any]] = {}
     start = 0
     for row in rows:
         shape = schema.shape(row.field)
-        if any(isinstance(n, str) for n in shape):
-            fixed = [n for n in shape if isinstance(n, int)]
+        fixed = [n for n in shape if isinstance(n, int)]
+        width = math.prod(fixed)
+        if len(fixed) < len(shape):
             table[row.field] = [value.reshape(-1, *fixed) for value in values]
         elif shape:
-            width = int(np.prod(shape))
-            table[row.field] = [value[start : start + width].reshape(shape) for value in values]
-            start += width
+            table[row.field] = [value[start : start + width].reshape(fixed) for value in values]
         else:
             table[row.field] = [value[start] for value in values]
-            start += 1
+        start += width
     return table
 
 
-def _surfaces(entities: _Entities, entity: str, table: Mapping[str, Sequence[Any]]) -> list[NDArray[np.float32]]:
-    buffers = entities.rows(entity, Archetype.SURFACES.value)[2]
-    formats = entities.rows(entity, "DepthImage:format")[2]
+def _surfaces(
+    buffers: Iterable[Any], formats: Iterable[Any], table: Mapping[str, Sequence[Any]]
+) -> list[NDArray[np.float32]]:
     surfaces = []
-    sides = table["fragment_side_px"]
-    for buffer, format_, px, side in zip(buffers, formats, table["fragment_px"], sides, strict=True):
-        image = buffer.view(np.float16).reshape(format_[0]["height"], format_[0]["width"])
-        surfaces.append(trace.unmosaic(image, trace.cells(px, float(side))))
+    fragments = zip(table["fragment_px"], table["fragment_side_px"], strict=True)
+    for buffer, (format_,), (px, side) in zip(buffers, formats, fragments, strict=True):
+        image = buffer.view(np.float16).reshape(format_["height"], format_["width"])
+        surfaces.append(traces.unmosaic(image, traces.cells(px, float(side))))
     return surfaces
-
-
-class _Entities:
-    """The temporal chunks of a run, by entity, in the order of the frames."""
-
-    def __init__(self, chunks: Iterable[Any], root: str) -> None:
-        self._batches: dict[str, list[pa.RecordBatch]] = {}
-        for chunk in chunks:
-            if not chunk.is_static and chunk.entity_path.startswith(f"{root}/"):
-                entity = chunk.entity_path.removeprefix(f"{root}/")
-                self._batches.setdefault(entity, []).append(chunk.to_record_batch())
-
-    def rows(self, entity: str, component: str) -> tuple[Ints, Ints, list[Any]]:
-        """Frames [n], sensor times [n] and one array of values per row."""
-        frames, t_ns, values = [], [], []
-        for batch in self._batches.get(entity, []):
-            if component in batch.schema.names:
-                frames.append(batch.column("frame").to_numpy())
-                t_ns.append(batch.column("sensor_time").to_numpy().astype(np.int64))
-                values += _lists(batch.column(component))
-        if not frames:
-            return np.empty(0, np.int64), np.empty(0, np.int64), []
-        all_frames, all_t_ns = np.concatenate(frames), np.concatenate(t_ns)
-        order = np.argsort(all_frames, kind="stable")
-        return all_frames[order], all_t_ns[order], [values[i] for i in order]
 
 
 def _lists(column: pa.ListArray) -> list[Any]:
@@ -675,7 +686,7 @@ def _lists(column: pa.ListArray) -> list[Any]:
     if pa.types.is_list(kind):
         column, kind = column.flatten(), kind.value_type
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
-        return column.to_pylist()
+        return list(column.to_pylist())
     bounds = np.cumsum([0, *column.value_lengths().to_pylist()])
     flat = column.flatten().to_numpy(zero_copy_only=False)
     return [flat[a:b] for a, b in itertools.pairwise(bounds)]
@@ -691,19 +702,19 @@ def _root(path: Path, run: str, schema: Schema, chunks: Iterable[Any]) -> str:
     raise RecordingError(path, f"holds no steps of a run named {run!r}", "name one of the runs in the file's folder")
 
 
-def _chunks(path: Path, content: str) -> Iterator[Any]:
+def _chunks(path: Path, content: str, *, is_static: bool | None = False) -> Iterator[Any]:
     """The chunks of some entities, also of a file without a footer or with a torn end."""
     if not path.is_file():
         raise RecordingError(path, "there is no such file", "give the path of an .rrd file")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            yield from _stream(path).filter(content=content, is_static=False)
+            yield from _stream(path).filter(content=content, is_static=is_static)
         except RuntimeError:
             with tempfile.TemporaryDirectory() as folder:
                 fixed = Path(folder) / "recovered.rrd"
                 recover(path, fixed)
-                yield from _stream(fixed).filter(content=content, is_static=False)
+                yield from _stream(fixed).filter(content=content, is_static=is_static)
 
 
 def _stream(path: Path) -> Any:
@@ -715,6 +726,9 @@ def _stream(path: Path) -> Any:
 
 
 # ------------------------------------------------------------------------- whole files
+
+
+_CURE = "give a file that a replay wrote"
 
 
 def merge(paths: Sequence[Path | str], out: Path | str) -> None:
@@ -733,6 +747,8 @@ def recover(path: Path | str, out: Path | str) -> None:
         RecordingError: nothing can be read.
     """
     _tool(Path(path), "filter", str(path), "-o", str(out), "--continue-on-error")
+    if not RrdReader(out).recordings():
+        raise RecordingError(path, "is not a Rerun recording, or nothing of it is whole", _CURE)
 
 
 def _tool(path: Path, *arguments: str) -> None:
@@ -741,4 +757,23 @@ def _tool(path: Path, *arguments: str) -> None:
     )
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
-        raise RecordingError(path, f"cannot be read as a Rerun recording ({reason})", "give a file that a replay wrote")
+        raise RecordingError(path, f"cannot be read as a Rerun recording ({reason})", _CURE)
+
+
+def digest(path: Path | str) -> str:
+    """SHA-256 of a file's data, equal for equal data however the rows were cut into chunks.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    rows: dict[tuple[str, ...], list[bytes]] = {}
+    for chunk in _chunks(Path(path), "/**", is_static=None):
+        batch = chunk.to_record_batch()
+        names = sorted(name for name in batch.schema.names if not name.startswith("rerun.controls."))
+        for row in batch.select(names).to_pylist():
+            key = (chunk.entity_path, str([row.get(name) for name in ("frame", "sensor_time")]), *names)
+            rows.setdefault(key, []).append(hashlib.sha256(repr(row).encode()).digest())
+    total = hashlib.sha256()
+    for key in sorted(rows):
+        total.update(repr((key, rows[key])).encode())
+    return total.hexdigest()

@@ -10,10 +10,12 @@ from __future__ import annotations
 
 import colorsys
 import enum
+import functools
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
+from pathlib import Path
+from typing import Any, NamedTuple, get_type_hints
 
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step, quantities
@@ -49,6 +51,16 @@ class Row:
     axes: tuple[str, ...] = ()
     also: str = ""
 
+    @property
+    def component(self) -> str:
+        """The component of the entity that holds the values, empty for a timeline."""
+        match self.archetype:
+            case Archetype.TIMELINE:
+                return ""
+            case Archetype.INTEGERS:
+                return f"{self.archetype.value}:{self.field}"
+        return self.archetype.value
+
 
 class Series(NamedTuple):
     """One line of a plot: its name in legends, its colour as RGBA."""
@@ -57,12 +69,17 @@ class Series(NamedTuple):
     colour: int
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(frozen=True)
 class Schema:
     """The rows of one Step class."""
 
     step_type: type[Step]
     rows: tuple[Row, ...]
+
+    @functools.cached_property
+    def kinds(self) -> dict[str, Any]:
+        """The declared type of each field."""
+        return get_type_hints(self.step_type)
 
     def of(self, archetype: Archetype) -> dict[str, tuple[Row, ...]]:
         """The rows of one archetype by entity, in order."""
@@ -203,8 +220,51 @@ def schema_of(step_type: type[Step]) -> Schema:
     return SCHEMAS[step_type]
 
 
-def markdown(schema: Schema) -> str:
-    """The table of `docs/schema.md` for one Step class."""
+_PREFACE = """# What is in the recording
+
+A mission has one file of what was measured, `sensors.rrd`, and one for each run, `RUN.rrd`; equal recording
+ids let one viewer show them together. Timelines: `frame` (number of the frame in its stream) and
+`sensor_time` (exact nanoseconds). World: z up, x forward, y left, metres. Image: u right, v down, pixels; the
+viewer puts the corner of the first pixel at (0, 0), so that drawings lie half a pixel further than the fields say.
+
+This page is made by `python -m workbench.schema`; a test demands that it is current.
+
+## Sensors
+| Entity | What |
+|---|---|
+| `/camera/image` | the images: stored JPEG and PNG bytes unaltered, others as PNG or raw pixels |
+| `/camera/problems` | frames without an image, and why |
+| `/world/reference/path`, `/pose`, `/heading` | the reference from above: whole path, and its pose at each frame |
+| `/sensors/reference` | the reference as numbers: x, y, z (m), heading (rad); on `sensor_time` |
+| `/world/scale` | a scale bar |
+| `/recording/facts` | facts of the recording |
+
+## Every run
+| Entity | What |
+|---|---|
+| `/runs/RUN/settings`, `/runs/RUN/summary` | settings, and what was found at the end |
+| `/runs/RUN/ESTIMATOR/verdict`, `/verdicts/NAME` | state lanes: the verdict, and each alarm that ever rang |
+| `/runs/RUN/ESTIMATOR/events` | log of where the verdict changed, and of what the replay met |
+| `/runs/RUN/ESTIMATOR/alarms` | log of every frame with an alarm |
+| `/runs/RUN/ESTIMATOR/numbers` | matrices and fragments of the frame as tables |
+| `/runs/RUN/ESTIMATOR/error` | x, y, distance (m), heading (rad) against the reference |
+| `/world/runs/RUN/raw`, `/corrected` | one point a frame, coloured by verdict |
+| `/world/runs/RUN/body`, `/heading`, `/covariance` | where it is now, with the 3σ ellipse of the position |
+| `/world/runs/RUN/path/NAME` | the whole path, raw, corrected and aligned with the reference |
+| `/camera/image/RUN/fragments`, `/search`, `/matches`, `/shifts` | drawn on the image |
+"""
+
+
+def document() -> str:
+    """The text of `docs/schema.md`."""
+    parts = [_PREFACE]
+    for schema in SCHEMAS.values():
+        parts.append(f"\n## Fields of `{schema.step_type.__name__}`\nEntities are below `/runs/RUN/ESTIMATOR`.\n\n")
+        parts.append(_markdown(schema) + "\n")
+    return "".join(parts)
+
+
+def _markdown(schema: Schema) -> str:
     lines = [
         "| Field | Entity | Component | Shape | Unit | Meaning | Also shown as |",
         "|---|---|---|---|---|---|---|",
@@ -214,7 +274,11 @@ def markdown(schema: Schema) -> str:
         field = declared[row.field]
         shape = " × ".join(str(n) for n in field["shape"]) or "–"
         entity = f"timeline `{row.entity}`" if row.archetype is Archetype.TIMELINE else f"`{row.entity}`"
-        component = "" if row.archetype is Archetype.TIMELINE else f"`{row.archetype.value}`"
+        component = f"`{row.component}`" if row.component else "–"
         cells = (f"`{row.field}`", entity, component, shape, field["unit"], field["meaning"], row.also)
         lines.append("| " + " | ".join(cells) + " |")
     return "\n".join(lines)
+
+
+if __name__ == "__main__":
+    (Path(__file__).parents[1] / "docs" / "schema.md").write_text(document(), encoding="utf-8")

@@ -9,7 +9,6 @@ from __future__ import annotations
 import functools
 import itertools
 import operator
-import typing
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any, NamedTuple
@@ -47,13 +46,8 @@ def columns(schema: Schema, steps: Sequence[Step]) -> dict[str, NDArray[Any]]:
     """
     names = [row.field for row in schema.rows]
     values = zip(*map(operator.attrgetter(*names), steps), strict=True)
-    kinds = _kinds(schema.step_type)
+    kinds = schema.kinds
     return {name: _column(column, kinds[name]) for name, column in zip(names, values, strict=True)}
-
-
-@functools.cache
-def _kinds(step_type: type[Step]) -> dict[str, Any]:
-    return typing.get_type_hints(step_type)
 
 
 def _column(values: tuple[Any, ...], kind: Any) -> NDArray[Any]:
@@ -78,11 +72,11 @@ def scalar_groups(schema: Schema, table: Columns) -> Iterator[tuple[str, Floats]
 
 def rebuild(schema: Schema, table: Mapping[str, Sequence[Any]]) -> Iterator[Step]:
     """The Steps of one sequence of values per field: the inverse of `columns`."""
-    kinds = _kinds(schema.step_type)
+    kinds = schema.kinds
     names = [row.field for row in schema.rows]
     casts = [np.asarray if schema.shape(name) else kinds[name] for name in names]
     for values in zip(*(table[name] for name in names), strict=True):
-        cast = {name: cast(value) for name, cast, value in zip(names, casts, values, strict=True)}
+        cast: dict[str, Any] = {name: cast(value) for name, cast, value in zip(names, casts, values, strict=True)}
         yield schema.step_type(**cast)
 
 
@@ -180,9 +174,13 @@ class Shapes(NamedTuple):
     colours: Colours | None = None
 
 
+def _finite(values: Floats, axes: int | tuple[int, ...]) -> NDArray[np.bool_]:
+    return np.asarray(np.isfinite(values).all(axis=axes), np.bool_)
+
+
 def shapes(points: Floats, extents: Floats, colours: Colours | None = None) -> Shapes:
     """Flatten shapes [n, F, 2] and leave out those with NaN."""
-    seen = np.isfinite(points).all(axis=2) & np.isfinite(extents).all(axis=2)
+    seen = _finite(points + extents, 2)
     chosen = None if colours is None else colours[seen]
     return Shapes(seen.sum(axis=1), points[seen], extents[seen], chosen)
 
@@ -190,7 +188,8 @@ def shapes(points: Floats, extents: Floats, colours: Colours | None = None) -> S
 def weight_colours(weight: Floats, accepted: NDArray[Any]) -> Colours:
     """RGBA of fragments: from red for weight 0 to green for 1, grey in steps that were not accepted."""
     share = np.clip(np.nan_to_num(weight), 0, 1)
-    red, green = (np.round(np.minimum(1, 2 * s) * 220).astype(np.uint32) for s in (1 - share, share))
+    red: Colours = np.round(np.minimum(1, 2 - 2 * share) * 220).astype(np.uint32)
+    green: Colours = np.round(np.minimum(1, 2 * share) * 220).astype(np.uint32)
     colours = (red << 24) | (green << 16) | np.uint32(0x30 << 8 | 0xFF)
     return np.where(np.asarray(accepted, bool)[:, None], colours, np.uint32(0xB0B0B0FF)).astype(np.uint32)
 
@@ -224,7 +223,7 @@ def ellipses(covariance: Floats, *, sigmas: float = 3.0) -> tuple[Floats, Floats
 
     NaN where the covariance is not finite.
     """
-    good = np.isfinite(covariance[:, :2, :2]).all(axis=(1, 2))
+    good = _finite(covariance[:, :2, :2], (1, 2))
     values, vectors = np.linalg.eigh(np.where(good[:, None, None], covariance[:, :2, :2], 0.0))
     half = np.where(good[:, None], sigmas * np.sqrt(np.maximum(values, 0)), np.nan)
     return half, np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0])
