@@ -113,6 +113,24 @@ def test_large_integers_and_odd_floats_are_exact(tmp_path: Path) -> None:
     assert read.pose.tobytes() == odd.pose.tobytes()
 
 
+def test_a_set_of_alarms_never_seen_by_this_process_reads_back() -> None:
+    step = next(fake_steps.steps(1))
+    table = {name: list(values) for name, values in traces.columns(CORRELATION, [step]).items()}
+    table["alarms"] = [np.float64(1 << 3 | 1 << 9 | 1 << 17)]
+    (read,) = traces.rebuild(CORRELATION, table)
+    assert read.alarms == Verdict.DUPLICATE_FRAME | Verdict.PEAK_AT_BORDER | Verdict.NOT_RIGID
+
+
+def test_some_fields_read_back_alone(tmp_path: Path) -> None:
+    steps = list(fake_steps.steps(20))
+    path = write_run(tmp_path / "run.rrd", steps)
+    read = rrd.read_fields(path, "best", CorrelationStep, ["pose", "frame", "verdict"])
+    assert list(read) == ["pose", "frame", "verdict"]
+    assert read["frame"] == list(range(20))
+    np.testing.assert_array_equal(read["pose"], [step.pose for step in steps])
+    np.testing.assert_array_equal(read["verdict"], [step.verdict for step in steps])
+
+
 def test_a_step_whose_fragments_change_reads_back(tmp_path: Path) -> None:
     steps = [*fake_steps.steps(5), *fake_steps.steps(5, fragment_count=2, start=5), *fake_steps.steps(3, start=10)]
     read = rrd.read_steps(write_run(tmp_path / "run.rrd", steps), "best", CorrelationStep)

@@ -597,38 +597,60 @@ def read_steps(path: Path | str, run: str, step_type: type[Step]) -> list[Step]:
         RecordingError: the file cannot be read, or holds no such run.
     """
     schema = schema_of(step_type)
-    chunks = list(_chunks(Path(path), f"/runs/{run}/**"))
-    root = _root(Path(path), run, schema, chunks)
-    rows = _whole_rows(chunks, root, schema)
+    fields = [row.field for row in schema.rows]
+    return list(traces.rebuild(schema, read_fields(path, run, step_type, fields)))
+
+
+def read_fields(path: Path | str, run: str, step_type: type[Step], fields: Iterable[str]) -> dict[str, Sequence[Any]]:
+    """Some fields of a run's steps: one value per frame, in the order of the frames.
+
+    Raises:
+        RecordingError: the file cannot be read, or holds no such run.
+    """
+    schema = schema_of(step_type)
+    wanted = list(fields)
+    needed = schema.sharing({*wanted, "verdict", *(_SURFACE_NEEDS if "surface" in wanted else ())})
+    components = sorted({row.component for row in needed if row.component} | {_FORMAT})
+    rows = _whole_rows(_chunks(Path(path), f"/runs/{run}/**", components=components), needed)
     frames, t_ns, _ = next(iter(rows.values()))
+    if not len(frames):
+        raise RecordingError(path, f"holds no steps of a run named {run!r}", "name a run of this file")
     table: dict[str, Sequence[Any]] = {}
-    for row in schema.rows:
+    for entity, group in schema.of(Archetype.SCALARS).items():
+        if (entity, group[0].component) in rows:
+            table |= _split(schema, group, rows[entity, group[0].component][2])
+    for row in needed:
         if row.archetype is Archetype.TIMELINE:
             table[row.field] = {"frame": frames, "sensor_time": t_ns}[row.entity].tolist()
         elif row.archetype is Archetype.INTEGERS:
             table[row.field] = [int(value[0]) for value in rows[row.entity, row.component][2]]
-    for entity, group in schema.of(Archetype.SCALARS).items():
-        table |= _split(schema, group, rows[entity, group[0].component][2])
-    for entity, (row,) in schema.of(Archetype.SURFACES).items():
-        formats = rows[entity, _FORMAT][2]
-        table[row.field] = _surfaces(rows[entity, row.component][2], formats, table)
-    return list(traces.rebuild(schema, table))
+        elif row.archetype is Archetype.SURFACES:
+            formats = rows[row.entity, _FORMAT][2]
+            table[row.field] = _surfaces(rows[row.entity, row.component][2], formats, table)
+    return {field: table[field] for field in wanted}
 
 
 _FORMAT = "DepthImage:format"
+_SURFACE_NEEDS = ("fragment_px", "fragment_side_px")  # where each surface lies in the mosaic
 _Rows = tuple[Ints, Ints, list[Any]]
 
 
-def _whole_rows(chunks: Iterable[Any], root: str, schema: Schema) -> dict[tuple[str, str], _Rows]:
+def _whole_rows(chunks: Iterable[Any], needed: Iterable[Row]) -> dict[tuple[str, str], _Rows]:
     """Frames, sensor times and values of each component, in the order of the frames.
 
     Frames that lack a component are left out: they stood at the torn end of a file.
     """
-    wanted = {(row.entity, row.component) for row in schema.rows if row.component}
-    wanted |= {(entity, _FORMAT) for entity in schema.of(Archetype.SURFACES)}
-    parts: dict[tuple[str, str], list[_Rows]] = {key: [] for key in wanted}
+    parts: dict[tuple[str, str], list[_Rows]] = {}
+    for row in needed:
+        if row.component:
+            parts[row.entity, row.component] = []
+        if row.archetype is Archetype.SURFACES:
+            parts[row.entity, _FORMAT] = []
+    entities = {entity for entity, _ in parts}
     for chunk in chunks:
-        entity = chunk.entity_path.removeprefix(f"{root}/")
+        entity = chunk.entity_path.split("/", 4)[-1]  # below /runs/RUN/ESTIMATOR
+        if entity not in entities:
+            continue
         batch = chunk.to_record_batch()
         for component in batch.schema.names:
             if (entity, component) in parts:
@@ -692,29 +714,21 @@ def _lists(column: pa.ListArray) -> list[Any]:
     return [flat[a:b] for a, b in itertools.pairwise(bounds)]
 
 
-def _root(path: Path, run: str, schema: Schema, chunks: Iterable[Any]) -> str:
-    """Where a run's fields lie: ``/runs/RUN/ESTIMATOR``."""
-    known = f"/{next(iter(schema.of(Archetype.SCALARS)))}"
-    for chunk in chunks:
-        parent = chunk.entity_path.removesuffix(known)
-        if parent != chunk.entity_path and parent.count("/") == 3:
-            return str(parent)
-    raise RecordingError(path, f"holds no steps of a run named {run!r}", "name one of the runs in the file's folder")
-
-
-def _chunks(path: Path, content: str, *, is_static: bool | None = False) -> Iterator[Any]:
+def _chunks(
+    path: Path, content: str, *, is_static: bool | None = False, components: Sequence[str] | None = None
+) -> Iterator[Any]:
     """The chunks of some entities, also of a file without a footer or with a torn end."""
     if not path.is_file():
         raise RecordingError(path, "there is no such file", "give the path of an .rrd file")
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")
         try:
-            yield from _stream(path).filter(content=content, is_static=is_static)
+            yield from _stream(path).filter(content=content, is_static=is_static, components=components)
         except RuntimeError:
             with tempfile.TemporaryDirectory() as folder:
                 fixed = Path(folder) / "recovered.rrd"
                 recover(path, fixed)
-                yield from _stream(fixed).filter(content=content, is_static=is_static)
+                yield from _stream(fixed).filter(content=content, is_static=is_static, components=components)
 
 
 def _stream(path: Path) -> Any:

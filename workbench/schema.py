@@ -12,7 +12,7 @@ import colorsys
 import enum
 import functools
 import math
-from collections.abc import Mapping
+from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple, get_type_hints
@@ -92,6 +92,11 @@ class Schema:
     def entity(self, field: str) -> str:
         """The entity of a field, relative to the run's root."""
         return next(row.entity for row in self.rows if row.field == field)
+
+    def sharing(self, fields: Collection[str]) -> tuple[Row, ...]:
+        """The rows of these fields and of all that share an entity with them."""
+        entities = {(row.archetype, row.entity) for row in self.rows if row.field in fields}
+        return tuple(row for row in self.rows if (row.archetype, row.entity) in entities)
 
     def shape(self, field: str) -> tuple[int | str, ...]:
         """The declared shape of a field; a letter stands for a length that the settings decide."""

@@ -70,11 +70,15 @@ def scalar_groups(schema: Schema, table: Columns) -> Iterator[tuple[str, Floats]
         yield entity, parts[0] if len(parts) == 1 else np.concatenate(parts, axis=1)
 
 
+def _exact(kind: Any) -> Any:
+    """A function from the logged number to a value of the declared type; flags want a true integer."""
+    return float if kind is float else lambda value: kind(int(value))
+
+
 def rebuild(schema: Schema, table: Mapping[str, Sequence[Any]]) -> Iterator[Step]:
     """The Steps of one sequence of values per field: the inverse of `columns`."""
-    kinds = schema.kinds
     names = [row.field for row in schema.rows]
-    casts = [np.asarray if schema.shape(name) else kinds[name] for name in names]
+    casts = [np.asarray if schema.shape(name) else _exact(schema.kinds[name]) for name in names]
     for values in zip(*(table[name] for name in names), strict=True):
         cast: dict[str, Any] = {name: cast(value) for name, cast, value in zip(names, casts, values, strict=True)}
         yield schema.step_type(**cast)
