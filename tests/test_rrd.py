@@ -1,6 +1,7 @@
 """What is written is read back bit for bit, whole or killed, and nothing of the wall clock is in it."""
 
 import dataclasses
+import functools
 import math
 import os
 import signal
@@ -24,6 +25,7 @@ from pipelines.estimator import Step
 from pipelines.verdict import Severity, Verdict
 from readers.streams import ImageSample, RecordingError, WorkbenchError
 from workbench import rrd, traces
+from workbench.blueprints import blueprint_of
 from workbench.schema import CORRELATION, SCHEMAS
 
 HALF_STEP = 2.0**-11  # half the distance of float16 numbers just below 2
@@ -441,8 +443,24 @@ def test_a_second_close_does_nothing(tmp_path: Path) -> None:
     assert len(rrd.read_steps(tmp_path / "run.rrd", "best", CorrelationStep)) == 3
 
 
-def test_every_schema_has_a_view() -> None:
-    from workbench.blueprints import Bounds, blueprint_of
+@pytest.mark.parametrize("step_type", SCHEMAS)
+def test_both_files_can_bring_the_same_view(tmp_path: Path, step_type: type[Step]) -> None:
+    view = functools.partial(blueprint_of, step_type, "best", "correlation")
+    shown = []
+    for name, given in (("plain", {}), ("run", {"view": view})):
+        with rrd.SensorWriter(tmp_path / f"{name}.rrd", recording_id="mission", **given) as writer:
+            writer.reference(fake_steps.reference(20))
+        shown.append(view_names(tmp_path / f"{name}.rrd"))
+    write_run(tmp_path / "best.rrd", fake_steps.steps(3))
+    assert shown[1] == view_names(tmp_path / "best.rrd") > shown[0] - {"Image"}
+    assert {"Verdicts", "Correlation surfaces", "Events", "Position error, m"} <= shown[1]
 
-    for step_type in SCHEMAS:
-        assert blueprint_of(step_type, "run", "name", Bounds()).root_container is not None
+
+def view_names(path: Path) -> set[str]:
+    reader = RrdReader(path)
+    names: set[str] = set()
+    for blueprint in reader.blueprints():
+        for chunk in reader.stream(store=blueprint).filter(components="ViewBlueprint:display_name"):
+            for row in chunk.to_record_batch().column("ViewBlueprint:display_name").to_pylist():
+                names.update(row)
+    return names

@@ -58,6 +58,22 @@ class Bounds:
     surfaces_px: tuple[float, float] | None = None
 
 
+def sensor_blueprint(bounds: Bounds) -> rrb.Blueprint:
+    """The view of a mission's sensors alone: image, reference from above, facts."""
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            _image("/camera/image", bounds.image_px, "Image"),
+            rrb.Vertical(
+                _map("", bounds.extent),
+                rrb.TextDocumentView(origin="/recording/facts", name="Recording"),
+                row_shares=[3, 2],
+            ),
+        ),
+        *_panels(),
+        auto_views=False,
+    )
+
+
 def blueprint_of(step_type: type[Step], run: str, estimator: str, bounds: Bounds) -> rrb.Blueprint:
     """The view of a run of the estimator that makes these steps; plain where there is none of its own."""
     if issubclass(step_type, CorrelationStep):
@@ -114,7 +130,7 @@ def _absolute(frame: int) -> rr.TimeRangeBoundary:
 
 
 def _map(run: str, extent: Extent | None) -> rrb.Spatial3DView:
-    """The ground from above: x to the right, y up."""
+    """The ground from above, x to the right, y up; the path of a run up to the cursor, where one is named."""
     eye = None
     if extent is not None:
         eye = rrb.EyeControls3D(
@@ -128,7 +144,7 @@ def _map(run: str, extent: Extent | None) -> rrb.Spatial3DView:
             for name in ("frame", "sensor_time")
         ]
     )
-    overrides: dict[Any, Any] = {f"/world/runs/{run}/{name}": trail for name in ("raw", "corrected")}
+    overrides: dict[Any, Any] = {f"/world/runs/{run}/{name}": trail for name in ("raw", "corrected") if run}
     return rrb.Spatial3DView(
         origin="/world",
         contents="/world/**",

@@ -17,7 +17,7 @@ import sys
 import tempfile
 import time
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import Any, Literal, Self
@@ -34,7 +34,7 @@ from pipelines.geometry import heading_of_quat
 from pipelines.verdict import Severity, Verdict
 from readers.streams import ImageError, ImageSample, PoseSample, RecordingError, WorkbenchError
 from workbench import traces
-from workbench.blueprints import Bounds, Extent, blueprint_of
+from workbench.blueprints import Bounds, Extent, blueprint_of, sensor_blueprint
 from workbench.schema import Archetype, Row, Schema, schema_of
 
 APPLICATION = "estimator_workbench"
@@ -196,14 +196,25 @@ class SensorWriter(_Writer):
         path: the file to write.
         recording_id: the mission's id, equal in all its files.
         raw_images: whether images without a viewable stored form go in as PNG or as raw pixels.
+        view: the view that the file brings along. A viewer shows that of the file it read last: give that of
+            a run (``functools.partial(blueprint_of, step_type, run, estimator)``) or open the run's file last.
 
     Raises:
         WorkbenchError: Rerun is switched off.
         RecordingError: the file cannot be written.
     """
 
-    def __init__(self, path: Path | str, *, recording_id: str, raw_images: Literal["png", "raw"] = "png") -> None:
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        recording_id: str,
+        raw_images: Literal["png", "raw"] = "png",
+        view: Callable[[Bounds], rr.blueprint.Blueprint] = sensor_blueprint,
+    ) -> None:
         super().__init__(path, recording_id)
+        self._view = view
+        self._file.blueprint(view(Bounds()))
         self._raw_images = raw_images
         self._images: list[tuple[int, int, Any, str]] = []
         self._pixels: list[tuple[int, int, NDArray[Any]]] = []
@@ -249,6 +260,7 @@ class SensorWriter(_Writer):
         extent = Extent.of(position[:, :2])
         self._arrow_m = extent.size_m * ARROW_SHARE
         self._file.scale_bar(extent)
+        self._file.blueprint(self._view(Bounds(extent=extent)))
         path = rr.LineStrips3D([_flat(position[:, :2])], colors=_COLOURS["reference"], radii=rr.Radius.ui_points(1.5))
         self._file.static(f"{REFERENCE}/path", path)
         self._file.static(f"{REFERENCE}/pose", *_marker("reference"))
@@ -430,7 +442,9 @@ class RunWriter(_Writer):
         self._file.static(f"{self._world}/body", *_marker("corrected"))
         self._file.static(
             f"{self._world}/covariance",
-            rr.Ellipsoids3D.from_fields(colors=_COLOURS["corrected"], line_radii=rr.Radius.ui_points(1)),
+            rr.Ellipsoids3D.from_fields(
+                colors=_COLOURS["corrected"], line_radii=rr.Radius.ui_points(1), fill_mode="MajorWireframe"
+            ),
         )
 
     def _legends(self, step: Step) -> None:
