@@ -1,0 +1,224 @@
+"""One saved view per estimator: what a viewer shows of a run without any hand work."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import rerun as rr
+import rerun.blueprint as rrb
+from numpy.typing import NDArray
+
+from pipelines.correlation.step import CorrelationStep
+from pipelines.estimator import Step
+
+
+@dataclass(frozen=True, slots=True)
+class Extent:
+    """A square on the ground: centre (x, y) and side in metres."""
+
+    x_m: float
+    y_m: float
+    size_m: float
+
+    @classmethod
+    def of(cls, points: NDArray[np.float64]) -> Extent:
+        """The square around points [n, 2]; 1 m where they do not tell."""
+        finite = points[np.isfinite(points).all(axis=1)]
+        if not len(finite):
+            return cls(0.0, 0.0, 1.0)
+        low, high = finite.min(axis=0), finite.max(axis=0)
+        x, y = (low + high) / 2
+        return cls(float(x), float(y), float((high - low).max()) or 1.0)
+
+    def bar(self) -> tuple[float, tuple[float, float]]:
+        """A round length of at most a quarter of the side, and where a scale bar of it begins (x, y)."""
+        power = 10.0 ** math.floor(math.log10(self.size_m / 4))
+        length = next(n * power for n in (5, 2, 1) if n * power <= self.size_m / 4)
+        return length, (self.x_m - self.size_m / 2, self.y_m - 0.58 * self.size_m)
+
+
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """What a view is to show in full; the viewer chooses where something is None.
+
+    Attributes:
+        frames: first and last frame, for the axes of the plots.
+        extent: the square on the ground, for the map.
+        image_px: width and height of the image.
+        surfaces_px: width and height of the mosaic of correlation surfaces.
+    """
+
+    frames: tuple[int, int] | None = None
+    extent: Extent | None = None
+    image_px: tuple[float, float] | None = None
+    surfaces_px: tuple[float, float] | None = None
+
+
+def sensor_blueprint(bounds: Bounds) -> rrb.Blueprint:
+    """The view of a mission's sensors alone: image, reference from above, facts."""
+    return rrb.Blueprint(
+        rrb.Horizontal(
+            _image("/camera/image", bounds.image_px, "Image"),
+            rrb.Vertical(
+                _map("", bounds.extent),
+                rrb.TextDocumentView(origin="/recording/facts", name="Recording"),
+                row_shares=[3, 2],
+            ),
+        ),
+        *_panels(),
+        auto_views=False,
+    )
+
+
+def blueprint_of(step_type: type[Step], run: str, estimator: str, bounds: Bounds) -> rrb.Blueprint:
+    """The view of a run of the estimator that makes these steps; plain where there is none of its own."""
+    if issubclass(step_type, CorrelationStep):
+        return correlation_blueprint(run, estimator, bounds)
+    return rrb.Blueprint(*_panels(), auto_views=True, auto_layout=True)
+
+
+def correlation_blueprint(run: str, estimator: str = "correlation", bounds: Bounds | None = None) -> rrb.Blueprint:
+    """Image, surfaces and map above; plots, tables and events in the middle; verdicts at the foot."""
+    bounds = bounds or Bounds()
+    root = f"/runs/{run}/{estimator}"
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(
+                _image("/camera/image", bounds.image_px, "Image: fragments, search areas, matches",
+                       contents=["/camera/image", f"/camera/image/{run}/**"]),
+                _image(f"{root}/search/surface", bounds.surfaces_px, "Correlation surfaces"),
+                _map(run, bounds.extent),
+            ),
+            rrb.Horizontal(_plots(root, bounds.frames), _texts(run, root), column_shares=[2, 1]),
+            rrb.StateTimelineView(origin=root, contents=[f"{root}/verdict", f"{root}/verdicts/**"], name="Verdicts",
+                                  time_view=_axis(bounds.frames)),
+            row_shares=[10, 8, 5],
+        ),
+        *_panels(),
+        auto_views=False,
+    )  # fmt: skip
+
+
+def _panels() -> Sequence[Any]:
+    return (
+        rrb.BlueprintPanel(state="collapsed"),
+        rrb.SelectionPanel(state="collapsed"),
+        rrb.TimePanel(state="collapsed", timeline="frame"),
+    )
+
+
+def _image(
+    origin: str, size_px: tuple[float, float] | None, name: str, *, contents: Sequence[str] = ("$origin/**",)
+) -> rrb.Spatial2DView:
+    bounds = None
+    if size_px is not None and np.isfinite(size_px).all():
+        bounds = rrb.VisualBounds2D(x_range=(0.0, size_px[0]), y_range=(0.0, size_px[1]))
+    return rrb.Spatial2DView(origin=origin, contents=list(contents), name=name, visual_bounds=bounds)
+
+
+def _axis(frames: tuple[int, int] | None) -> rrb.TimeAxis:
+    first, last = (rr.TimeRangeBoundary.infinite(),) * 2 if frames is None else map(_absolute, frames)
+    return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
+
+
+def _absolute(frame: int) -> rr.TimeRangeBoundary:
+    return rr.TimeRangeBoundary.absolute(seq=frame)
+
+
+def _map(run: str, extent: Extent | None) -> rrb.Spatial3DView:
+    """The ground from above, x to the right, y up; the path of a run up to the cursor, where one is named."""
+    eye = None
+    if extent is not None:
+        eye = rrb.EyeControls3D(
+            position=(extent.x_m, extent.y_m, 1.3 * extent.size_m),
+            look_target=(extent.x_m, extent.y_m, 0.0),
+            eye_up=(0.0, 1.0, 0.0),
+        )
+    trail = rrb.VisibleTimeRanges(
+        [
+            rr.VisibleTimeRange(name, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative())
+            for name in ("frame", "sensor_time")
+        ]
+    )
+    overrides: dict[Any, Any] = {f"/world/runs/{run}/{name}": trail for name in ("raw", "corrected") if run}
+    return rrb.Spatial3DView(
+        origin="/world",
+        contents="/world/**",
+        name="From above: reference green, raw grey, corrected blue",
+        eye_controls=eye,
+        overrides=overrides,
+        background=[18, 20, 24],
+    )
+
+
+def _plots(root: str, frames: tuple[int, int] | None) -> rrb.Tabs:
+    def plot(name: str, entity: str, *, legend: bool = True, show: Sequence[bool] = ()) -> rrb.TimeSeriesView:
+        lines = rr.SeriesLines.from_fields(visible_series=list(show))
+        overrides: dict[Any, Any] = {f"{root}/{entity}": lines} if show else {}
+        return rrb.TimeSeriesView(
+            origin=f"{root}/{entity}",
+            contents="$origin",
+            name=name,
+            axis_x=_axis(frames),
+            overrides=overrides,
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
+        )
+
+    xy = [place in (0, 4) for place in range(9)]
+    heading = [place == 8 for place in range(9)]
+    return rrb.Tabs(
+        rrb.Horizontal(
+            plot("Shift since the frame before, px", "motion/frame_shift"),
+            plot("Shift from the template frame, px", "fit/centre_shift"),
+            name="Shift",
+        ),
+        rrb.Horizontal(
+            plot("Subpixel Δ of the fragments, px (u blue, v orange)", "subpixel/delta", legend=False),
+            plot("Left by the rigid fit, px (u blue, v orange)", "fit/residual", legend=False),
+            name="Δ",
+        ),
+        rrb.Horizontal(
+            plot("Δα since the frame before, rad", "motion/delta_heading", legend=False),
+            plot("Heading α, rad", "motion/heading", legend=False),
+            name="Δα, α",
+        ),
+        rrb.Horizontal(
+            plot("Peak correlation", "search/peak_correlation", legend=False),
+            plot("Second peak over first", "search/peak_ratio", legend=False),
+            plot("Residual rms, grey", "subpixel/residual_rms", legend=False),
+            plot("Inliers", "fit/inliers", legend=False),
+            name="Quality",
+        ),
+        rrb.Horizontal(
+            plot("Correction and its sum, m", "correction/applied"),
+            plot("Path of the segment and its reference, m", "correction/segment"),
+            name="Correction",
+        ),
+        rrb.Horizontal(
+            plot("Position error, m", "error", show=[True, True, True, False]),
+            plot("Heading error, rad", "error", legend=False, show=[False, False, False, True]),
+            name="Errors",
+        ),
+        rrb.Horizontal(
+            plot("Variance of x (blue) and y, m²", "pose/covariance", legend=False, show=xy),
+            plot("Variance of the heading, rad²", "pose/covariance", legend=False, show=heading),
+            name="Covariance",
+        ),
+    )
+
+
+def _texts(run: str, root: str) -> rrb.Tabs:
+    columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
+    return rrb.Tabs(
+        rrb.TextDocumentView(origin=f"{root}/numbers", name="Numbers"),
+        rrb.TextLogView(origin=f"{root}/events", name="Events", columns=columns),
+        rrb.TextLogView(origin=f"{root}/alarms", name="Every alarm", columns=columns),
+        rrb.TextDocumentView(origin=f"/runs/{run}/summary", name="Summary"),
+        rrb.TextDocumentView(origin=f"/runs/{run}/settings", name="Settings"),
+        rrb.TextDocumentView(origin="/recording/facts", name="Recording"),
+        active_tab=1,
+    )

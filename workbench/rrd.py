@@ -1,0 +1,807 @@
+"""Rerun recordings: the only module that writes and reads ``.rrd`` files.
+
+A mission has one file of what was measured (`SensorWriter`) and one per run of what was concluded
+(`RunWriter`); equal recording ids let one viewer show them together. Both write columns, close with a
+footer, keep about half a second in memory, and put nothing of the wall clock into the data.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import hashlib
+import itertools
+import math
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import Any, Literal, Self
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+
+from pipelines.estimator import Step
+from pipelines.geometry import heading_of_quat
+from pipelines.verdict import Severity, Verdict
+from readers.streams import ImageError, ImageSample, PoseSample, RecordingError, WorkbenchError
+from workbench import traces
+from workbench.blueprints import Bounds, Extent, blueprint_of, sensor_blueprint
+from workbench.schema import Archetype, Row, Schema, schema_of
+
+APPLICATION = "estimator_workbench"
+IMAGE = "/camera/image"
+REFERENCE = "/world/reference"
+
+MAX_ROWS = 1024
+MAX_BYTES = 2 << 20
+MAX_AGE_S = 0.5
+ARROW_SHARE = 0.08
+"""Length of the arrows of heading, in sides of the map."""
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+_LEVELS = {Severity.FINE: "INFO", Severity.NOTICE: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
+_COLOURS = {"reference": 0x2ECC71FF, "raw": 0x9E9E9EFF, "corrected": 0x4FC3F7FF, "aligned": 0xCE93D8FF}
+
+
+# ---------------------------------------------------------------------------- one file
+
+
+class _File:
+    """One ``.rrd`` that is being written: an explicit stream of columns on both timelines."""
+
+    def __init__(self, path: Path, recording_id: str) -> None:
+        self._rec = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
+        if not rr.is_enabled(self._rec):
+            raise WorkbenchError(f"{path}: Rerun is switched off by the environment; unset RERUN or set RERUN=on")
+        try:
+            path.parent.mkdir(parents=True, exist_ok=True)
+            self._rec.save(path)
+        except (OSError, RuntimeError) as error:
+            raise RecordingError(path, f"cannot be written ({error})", "choose another folder with -o") from error
+        self._rec.set_log_time_enabled(False)
+        self._rec.set_log_tick_enabled(False)
+        self.static("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
+
+    def static(self, entity: str, *what: rr.AsComponents) -> None:
+        """Log what holds for the whole recording."""
+        self._rec.log(entity, *what, static=True, strict=True)
+
+    def send(self, entity: str, frames: Ints | None, t_ns: Ints, *columns: Iterable[Any]) -> None:
+        """Log rows of one entity at sensor times [n] and at frames [n], where they belong to frames."""
+        if len(t_ns):
+            times = [rr.TimeColumn("sensor_time", timestamp=np.asarray(t_ns, np.int64).view("datetime64[ns]"))]
+            if frames is not None:
+                times.append(rr.TimeColumn("frame", sequence=frames))
+            self._rec.send_columns(entity, times, [c for group in columns for c in group], strict=True)
+
+    def scale_bar(self, extent: Extent) -> None:
+        """Draw a round length below the map."""
+        length, (x, y) = extent.bar()
+        line = rr.LineStrips3D(
+            [[(x, y, 0.0), (x + length, y, 0.0)]],
+            labels=[f"{length:g} m"], show_labels=True, colors=0xFFFFFFFF, radii=rr.Radius.ui_points(1.5),
+        )  # fmt: skip
+        self.static("/world/scale", line)
+
+    def flush(self) -> None:
+        """Hand everything to the operating system: a process killed after this loses nothing of it."""
+        self._rec.flush()
+
+    def blueprint(self, blueprint: rr.blueprint.Blueprint) -> None:
+        """Make this the view of the file."""
+        self._rec.send_blueprint(blueprint, make_active=True, make_default=True)
+
+    def close(self) -> None:
+        """Write the footer."""
+        self._rec.flush()
+        self._rec.disconnect()
+
+
+def _blobs(items: Sequence[Any]) -> Any:
+    """Buffers of bytes as one Arrow array of blobs, copied once."""
+    parts = [np.frombuffer(item, np.uint8) for item in items]
+    offsets = np.cumsum([0, *map(len, parts)], dtype=np.int32)
+    kind = rr.components.BlobBatch._ARROW_DATATYPE
+    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(np.concatenate(parts)), type=kind)
+
+
+def _repeated(column: rr.ComponentColumnList, count: int) -> rr.ComponentColumnList:
+    """A column of one row, `count` times."""
+    repeated = []
+    for one in column:
+        values = one.component_batch.as_arrow_array().take(pa.array(np.zeros(count, np.int64)))
+        repeated.append(rr.ComponentColumn(one.component_descriptor(), _Arrow(values)))
+    return rr.ComponentColumnList(repeated)
+
+
+class _Arrow:
+    """An Arrow array where Rerun wants a batch."""
+
+    def __init__(self, values: pa.Array) -> None:
+        self._values = values
+
+    def as_arrow_array(self) -> pa.Array:
+        return self._values
+
+
+def _texts(events: Sequence[traces.Event]) -> rr.ComponentColumnList:
+    return rr.TextLog.columns(text=[e.text for e in events], level=[_LEVELS[e.severity] for e in events])
+
+
+def _flat(points: Floats) -> NDArray[np.float32]:
+    """Points [n, 2] on the ground as [n, 3] in the viewer's precision."""
+    with np.errstate(over="ignore"):
+        return np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
+
+
+def _document(text: str) -> rr.TextDocument:
+    return rr.TextDocument(text, media_type="text/markdown")
+
+
+class _Writer:
+    """What both writers share: the file, the age of the buffer, and an orderly end."""
+
+    def __init__(self, path: Path | str, recording_id: str) -> None:
+        self._file = _File(Path(path), recording_id)
+        self._sent = -np.inf
+        self._open = True
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def flush(self) -> None:
+        """Write what is buffered."""
+        self._write()
+        self._file.flush()
+        self._sent = time.monotonic()
+
+    def close(self) -> None:
+        """Write what is buffered and the footer; a second call does nothing."""
+        if self._open:
+            self._open = False
+            self._write()
+            self._file.close()
+
+    def _flush_if(self, full: bool) -> None:
+        if full or time.monotonic() - self._sent > MAX_AGE_S:
+            self.flush()
+
+    def _write(self) -> None:
+        raise NotImplementedError
+
+
+# ----------------------------------------------------------------------------- sensors
+
+
+class SensorWriter(_Writer):
+    """Writes what was measured: the images as they were stored, the reference, facts of the recording.
+
+    Args:
+        path: the file to write.
+        recording_id: the mission's id, equal in all its files.
+        raw_images: whether images without a viewable stored form go in as PNG or as raw pixels.
+        view: the view that the file brings along. A viewer shows that of the file it read last: give that of
+            a run (``functools.partial(blueprint_of, step_type, run, estimator)``) or open the run's file last.
+
+    Raises:
+        WorkbenchError: Rerun is switched off.
+        RecordingError: the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        recording_id: str,
+        raw_images: Literal["png", "raw"] = "png",
+        view: Callable[[Bounds], rr.blueprint.Blueprint] = sensor_blueprint,
+    ) -> None:
+        super().__init__(path, recording_id)
+        self._view = view
+        self._file.blueprint(view(Bounds()))
+        self._raw_images = raw_images
+        self._images: list[tuple[int, int, Any, str]] = []
+        self._pixels: list[tuple[int, int, NDArray[Any]]] = []
+        self._frames: list[tuple[int, int]] = []
+        self._bytes = 0
+        self._reference: tuple[Ints, Floats, Floats] | None = None
+        self._arrow_m = 1.0
+
+    def image(self, frame: int, sample: ImageSample) -> None:
+        """Log a frame's image; stored JPEG and PNG bytes pass through unaltered.
+
+        Raises:
+            ImageError: the image has to be decoded for the log and cannot be.
+        """
+        if sample.media_type is not None:
+            self._encoded(frame, sample.t_ns, sample.data, sample.media_type)
+        else:
+            pixels = sample.grey() if _is_grey(sample.encoding) else sample.colour()
+            if self._raw_images == "raw":
+                self._pixels.append((frame, sample.t_ns, pixels))
+                self._bytes += pixels.nbytes
+            else:
+                self._encoded(frame, sample.t_ns, _png(pixels, sample), "image/png")
+        self._frames.append((frame, sample.t_ns))
+        self._flush_if(self._bytes > MAX_BYTES or len(self._frames) >= MAX_ROWS)
+
+    def undecodable(self, frame: int, t_ns: int, reason: str) -> None:
+        """Log that a frame has no image, and why; the viewer then shows none."""
+        self._write()
+        at = np.array([frame]), np.array([t_ns])
+        self._file.send("/camera/problems", *at, rr.TextLog.columns(text=[reason], level=["ERROR"]))
+        self._file.send(IMAGE, *at, rr.Clear.columns(is_recursive=[False]))
+
+    def reference(self, poses: Sequence[PoseSample]) -> None:
+        """Log the reference: its path, its numbers, and from now on its pose at every image's time."""
+        ordered = sorted(poses, key=lambda pose: pose.t_ns)
+        if not ordered:
+            return
+        t_ns = np.array([pose.t_ns for pose in ordered], np.int64)
+        position = np.array([pose.position_m for pose in ordered], np.float64)
+        heading = np.array([heading_of_quat(pose.quat_xyzw) for pose in ordered])
+        self._reference = t_ns, position, np.unwrap(heading)
+        extent = Extent.of(position[:, :2])
+        self._arrow_m = extent.size_m * ARROW_SHARE
+        self._file.scale_bar(extent)
+        self._file.blueprint(self._view(Bounds(extent=extent)))
+        path = rr.LineStrips3D([_flat(position[:, :2])], colors=_COLOURS["reference"], radii=rr.Radius.ui_points(1.5))
+        self._file.static(f"{REFERENCE}/path", path)
+        self._file.static(f"{REFERENCE}/pose", *_marker("reference"))
+        names = ["x [m]", "y [m]", "z [m]", "heading [rad]"]
+        self._file.static("/sensors/reference", rr.SeriesLines(names=names))
+        values = rr.Scalars.columns(scalars=np.column_stack([position, heading]))
+        self._file.send("/sensors/reference", None, t_ns, values)
+
+    def facts(self, lines: Iterable[str]) -> None:
+        """Log facts of the recording, one Markdown line each."""
+        self._file.static("/recording/facts", _document("\n".join(f"- {line}" for line in lines)))
+
+    def _encoded(self, frame: int, t_ns: int, data: Any, media_type: str) -> None:
+        self._images.append((frame, t_ns, data, media_type))
+        self._bytes += len(data)
+
+    def _write(self) -> None:
+        if self._images:
+            frames, t_ns, data, media = zip(*self._images, strict=True)
+            columns = rr.EncodedImage.columns(blob=_blobs(data), media_type=list(media))
+            self._file.send(IMAGE, np.array(frames), np.array(t_ns), columns)
+        for frame, when, pixels in self._pixels:
+            columns = rr.Image.columns(buffer=[pixels.tobytes()], format=[_format(pixels)])
+            self._file.send(IMAGE, np.array([frame]), np.array([when]), columns)
+        if self._frames and self._reference is not None:
+            frames, t_ns = np.array(self._frames, np.int64).T
+            self._write_reference(frames, t_ns, *self._reference)
+        self._images, self._pixels, self._frames, self._bytes = [], [], [], 0
+
+    def _write_reference(self, frames: Ints, t_ns: Ints, at_ns: Ints, position: Floats, heading: Floats) -> None:
+        inside = (t_ns >= at_ns[0]) & (t_ns <= at_ns[-1])
+        frames, t_ns = frames[inside], t_ns[inside]
+        since, known = (t_ns - at_ns[0]).astype(float), (at_ns - at_ns[0]).astype(float)
+        x, y, alpha = (np.interp(since, known, values) for values in (position[:, 0], position[:, 1], heading))
+        points = _flat(np.column_stack([x, y]))
+        self._file.send(f"{REFERENCE}/pose", frames, t_ns, rr.Points3D.columns(positions=points))
+        vectors = _flat(self._arrow_m * np.column_stack([np.cos(alpha), np.sin(alpha)]))
+        good = np.isfinite(vectors).all(axis=1)
+        arrows = rr.Arrows3D.columns(vectors=vectors[good], origins=points[good])
+        self._file.send(f"{REFERENCE}/heading", frames[good], t_ns[good], arrows)
+
+
+def _is_grey(encoding: str) -> bool:
+    return encoding.lower().startswith(("mono", "8uc1", "16uc1"))
+
+
+def _png(pixels: NDArray[Any], sample: ImageSample) -> bytes:
+    bgr = pixels if pixels.ndim == 2 else cv2.cvtColor(pixels, cv2.COLOR_RGB2BGR)
+    good, data = cv2.imencode(".png", bgr, [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not good:
+        raise ImageError(f"{sample.source or sample.stream}: the image cannot be encoded as PNG")
+    return bytes(data)
+
+
+def _format(pixels: NDArray[Any]) -> rr.components.ImageFormat:
+    return rr.components.ImageFormat(
+        width=pixels.shape[1],
+        height=pixels.shape[0],
+        color_model="L" if pixels.ndim == 2 else "RGB",
+        channel_datatype="U8" if pixels.dtype == np.uint8 else "U16",
+    )
+
+
+def _marker(name: str) -> tuple[rr.AsComponents, ...]:
+    return (rr.Points3D.from_fields(colors=_COLOURS[name], radii=rr.Radius.ui_points(5)),)
+
+
+# -------------------------------------------------------------------------------- runs
+
+
+class RunWriter(_Writer):
+    """Writes what one run concluded: every field of its steps, overlays, trajectory, verdicts.
+
+    Args:
+        path: the file to write.
+        recording_id: the mission's id, equal in all its files.
+        run: name of the run, one part of an entity path.
+        estimator: name of the estimator, likewise.
+        step_type: class of the steps; it needs a schema.
+        settings_text: the settings as they are saved beside the result.
+        extent: what of the ground the map shows until the run's own path is known, such as the reference's.
+
+    Raises:
+        WorkbenchError: Rerun is switched off, or the Step class has no schema.
+        RecordingError: the file cannot be written.
+    """
+
+    def __init__(
+        self,
+        path: Path | str,
+        *,
+        recording_id: str,
+        run: str,
+        estimator: str,
+        step_type: type[Step],
+        settings_text: str,
+        extent: Extent | None = None,
+    ) -> None:
+        self._schema = schema_of(step_type)
+        self._run, self._estimator = run, estimator
+        super().__init__(path, recording_id)
+        self._root = f"/runs/{run}/{estimator}"
+        self._world = f"/world/runs/{run}"
+        self._steps: list[Step] = []
+        self._shape_of = traces.shape_of(self._schema)
+        self._shape: Any = None
+        self._changes = traces.Changes()
+        self._lanes: dict[Verdict, bool] = {}
+        self._path: list[tuple[Ints, Ints, Floats, Floats]] = []
+        self._arrangement: bytes | None = None
+        self._file.static(f"/runs/{run}/settings", rr.TextDocument(settings_text, media_type="text/plain"))
+        self._constants()
+        self._bounds = Bounds(extent=extent)
+        self._view()
+
+    def step(self, step: Step) -> None:
+        """Log one step."""
+        shape = self._shape_of(step)
+        if shape != self._shape:
+            self._write()
+            self._shape = shape
+            self._legends(step)
+        self._steps.append(step)
+        self._flush_if(len(self._steps) >= self._capacity)
+
+    def event(self, frame: int, t_ns: int, severity: Severity, text: str) -> None:
+        """Log something worth stepping to that no verdict says."""
+        columns = _texts([traces.Event(0, severity, text)])
+        self._file.send(f"{self._root}/events", np.array([frame]), np.array([t_ns]), columns)
+
+    def errors(self, frames: Ints, t_ns: Ints, values: Floats) -> None:
+        """Log the errors against the reference: x, y, distance (m), heading (rad) [n, 4] at frames and times [n]."""
+        self._file.static(
+            f"{self._root}/error", rr.SeriesLines(names=["x [m]", "y [m]", "distance [m]", "heading [rad]"])
+        )
+        columns = rr.Scalars.columns(scalars=np.asarray(values, np.float64))
+        self._file.send(f"{self._root}/error", np.asarray(frames, np.int64), np.asarray(t_ns, np.int64), columns)
+
+    def finish(self, summary: Mapping[str, str | float | int], aligned_path: Floats | None) -> None:
+        """Log what is known at the end: the summary, the whole path, and the path [n, 2] aligned with the reference."""
+        self.flush()
+        rows = "\n".join(f"| {key} | {_number(value)} |" for key, value in summary.items())
+        self._file.static(f"/runs/{self._run}/summary", _document(f"| | |\n|---|---|\n{rows}"))
+        if aligned_path is not None and len(aligned_path):
+            self._line("aligned", aligned_path)
+        if self._path:
+            frames, t_ns, raw, pose = (np.concatenate(column) for column in zip(*self._path, strict=True))
+            self._finish_path(frames, t_ns, raw, pose)
+
+    # ---- what is logged once
+
+    def _constants(self) -> None:
+        verdicts = list(Verdict)
+        names = [str(v.name) for v in [Verdict.OK, *verdicts]]
+        colours = [traces.SEVERITY_COLOURS[v.severity] for v in [Verdict.OK, *verdicts]]
+        lanes = rr.StateConfiguration(values=names, labels=names, colors=colours)
+        self._file.static(f"{self._root}/verdict", lanes)
+        thin, thick = rr.Radius.ui_points(0.75), rr.Radius.ui_points(1.25)
+        image = f"{IMAGE}/{self._run}"
+        self._file.static(f"{image}/fragments", rr.Boxes2D.from_fields(colors=0xFFFFFFB0, radii=thin, draw_order=11))
+        self._file.static(f"{image}/search", rr.Boxes2D.from_fields(colors=0x4FC3F7FF, radii=thin, draw_order=10))
+        self._file.static(f"{image}/matches", rr.Boxes2D.from_fields(radii=thick, draw_order=12))
+        self._file.static(f"{image}/shifts", rr.Arrows2D.from_fields(radii=thick, draw_order=13))
+        surface = f"{self._root}/{self._schema.entity('surface')}"
+        self._file.static(
+            surface,
+            rr.DepthImage.from_fields(
+                colormap="viridis", depth_range=(-0.5, 1.0), meter=1.0, magnification_filter="nearest"
+            ),
+        )
+        for name, colour, radius in (("second", 0xFF8A65FF, 3), ("first", 0xFF1744FF, 4)):
+            marks = rr.Points2D.from_fields(colors=colour, radii=rr.Radius.ui_points(radius))
+            self._file.static(f"{surface}/{name}", marks)
+        labels = rr.Points2D.from_fields(colors=0xFFFFFFFF, radii=rr.Radius.ui_points(0), show_labels=True)
+        self._file.static(f"{surface}/labels", labels)
+        for name in ("raw", "corrected"):
+            self._file.static(f"{self._world}/{name}", rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
+        self._file.static(f"{self._world}/raw", rr.Points3D.from_fields(colors=_COLOURS["raw"]))
+        self._file.static(f"{self._world}/body", *_marker("corrected"))
+        self._file.static(
+            f"{self._world}/covariance",
+            rr.Ellipsoids3D.from_fields(
+                colors=_COLOURS["corrected"], line_radii=rr.Radius.ui_points(1), fill_mode="MajorWireframe"
+            ),
+        )
+
+    def _legends(self, step: Step) -> None:
+        """Log the names of the series, which depend on the number of fragments."""
+        table = traces.columns(self._schema, [step])
+        for entity, values in traces.scalar_groups(self._schema, table):
+            names, colours = zip(*self._schema.series(entity, values.shape[1]), strict=True)
+            lines = rr.SeriesLines(names=names, colors=np.array(colours, np.uint32))
+            self._file.static(f"{self._root}/{entity}", lines)
+        labels = [str(k + 1) for k in range(table["fragment_px"].shape[1])]
+        self._file.static(f"{IMAGE}/{self._run}/fragments", rr.Boxes2D.from_fields(labels=labels))
+        group = next(traces.mosaics(table))
+        height, width = group.images.shape[1:]
+        image_px = tuple(table["image_size_px"][0].tolist())
+        self._view(image_px=image_px, surfaces_px=(float(width), float(height)))
+        bytes_a_step = table["surface"].nbytes + 4096
+        self._capacity = max(1, min(MAX_ROWS, MAX_BYTES // bytes_a_step))
+
+    # ---- what is logged with every step
+
+    def _write(self) -> None:
+        if not self._steps:
+            return
+        table = traces.columns(self._schema, self._steps)
+        self._steps = []
+        self._values(table)
+        self._surfaces(table)
+        self._overlays(table)
+        self._map(table)
+        self._verdicts(table)
+        texts = traces.numbers(table)
+        media = _repeated(rr.TextDocument.columns(media_type=["text/markdown"]), len(texts))
+        self._send("numbers", table, rr.TextDocument.columns(text=texts), media)
+
+    def _send(self, entity: str, table: traces.Columns, *columns: Iterable[Any]) -> None:
+        path = entity if entity.startswith("/") else f"{self._root}/{entity}"
+        self._file.send(path, table["frame"], table["t_ns"], *columns)
+
+    def _values(self, table: traces.Columns) -> None:
+        for entity, values in traces.scalar_groups(self._schema, table):
+            self._send(entity, table, rr.Scalars.columns(scalars=values))
+        for entity, rows in self._schema.of(Archetype.INTEGERS).items():
+            integers = {row.field: table[row.field] for row in rows}
+            self._send(entity, table, rr.DynamicArchetype.columns(Archetype.INTEGERS.value, components=integers))
+
+    def _surfaces(self, table: traces.Columns) -> None:
+        root = f"{self._root}/{self._schema.entity('surface')}"
+        for group in traces.mosaics(table):
+            frames, t_ns = table["frame"][group.rows], table["t_ns"][group.rows]
+            n, height, width = group.images.shape
+            blobs = _blobs(list(group.images.view(np.uint8).reshape(n, -1)))
+            format_ = rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="F16")
+            self._file.send(
+                root, frames, t_ns,
+                rr.DepthImage.columns(buffer=blobs),
+                _repeated(rr.DepthImage.columns(format=[format_]), n),
+            )  # fmt: skip
+            for name, points in (("second", group.second), ("first", group.first)):
+                marks = traces.shapes(points, points)
+                columns = rr.Points2D.columns(positions=marks.points).partition(marks.counts)
+                self._file.send(f"{root}/{name}", frames, t_ns, columns)
+            if group.corners.tobytes() != self._arrangement:
+                self._arrangement = group.corners.tobytes()
+                labels = [str(k + 1) for k in range(len(group.corners))]
+                columns = rr.Points2D.columns(positions=group.corners + 1.5, labels=labels).partition([len(labels)])
+                self._file.send(f"{root}/labels", frames[:1], t_ns[:1], columns)
+
+    def _overlays(self, table: traces.Columns) -> None:
+        for name, drawn in traces.overlays(table).items():
+            colours: dict[str, Any] = {} if drawn.colours is None else {"colors": drawn.colours}
+            columns = (
+                rr.Arrows2D.columns(origins=drawn.points, vectors=drawn.extents, **colours)
+                if name == "shifts"
+                else rr.Boxes2D.columns(centers=drawn.points, half_sizes=drawn.extents, **colours)
+            )
+            self._send(f"{IMAGE}/{self._run}/{name}", table, columns.partition(drawn.counts))
+
+    def _map(self, table: traces.Columns) -> None:
+        raw, pose = table["pose_raw"], table["pose"]
+        colours = traces.verdict_colours(table["verdict"], _COLOURS["corrected"])
+        at = _flat(pose[:, :2])
+        self._send(f"{self._world}/raw", table, rr.Points3D.columns(positions=_flat(raw[:, :2])))
+        self._send(f"{self._world}/corrected", table, rr.Points3D.columns(positions=at, colors=colours))
+        self._send(f"{self._world}/body", table, rr.Points3D.columns(positions=at))
+        half, angle = traces.ellipses(table["pose_covariance"])
+        turn = np.column_stack([np.zeros((len(at), 2)), np.sin(angle / 2), np.cos(angle / 2)])
+        columns = rr.Ellipsoids3D.columns(half_sizes=_flat(np.nan_to_num(half)), centers=at, quaternions=turn)
+        self._send(f"{self._world}/covariance", table, columns)
+        self._path.append((table["frame"], table["t_ns"], raw, pose))
+
+    def _verdicts(self, table: traces.Columns) -> None:
+        events, changes = self._changes.take(table)
+        self._log("events", table, events)
+        self._log("alarms", table, traces.verdict_lines(table))
+        if not changes:
+            return
+        at = np.array([row for row, _, _ in changes])
+        frames, t_ns = table["frame"][at], table["t_ns"][at]
+        names = [str(verdict.name) for _, verdict, _ in changes]
+        self._file.send(f"{self._root}/verdict", frames, t_ns, rr.StateChange.columns(state=names))
+        for row, _, alarms in changes:
+            self._alarm_lanes(int(table["frame"][row]), int(table["t_ns"][row]), alarms)
+
+    def _alarm_lanes(self, frame: int, t_ns: int, alarms: Verdict) -> None:
+        """One lane for every alarm that ever rang."""
+        for flag in Verdict:
+            rings = flag in alarms
+            if rings == self._lanes.get(flag, False):
+                continue
+            entity = f"{self._root}/verdicts/{flag.name}"
+            if flag not in self._lanes:
+                name, colour = str(flag.name), traces.SEVERITY_COLOURS[flag.severity]
+                self._file.static(entity, rr.StateConfiguration(values=[name], labels=[name], colors=[colour]))
+            self._lanes[flag] = rings
+            state = str(flag.name) if rings else ""
+            self._file.send(entity, np.array([frame]), np.array([t_ns]), rr.StateChange.columns(state=[state]))
+
+    def _log(self, entity: str, table: traces.Columns, events: Sequence[traces.Event]) -> None:
+        if events:
+            at = np.array([event.row for event in events])
+            self._file.send(f"{self._root}/{entity}", table["frame"][at], table["t_ns"][at], _texts(events))
+
+    # ---- what is logged at the end
+
+    def _line(self, name: str, points: Floats) -> None:
+        finite = points[np.isfinite(points).all(axis=1)]
+        line = rr.LineStrips3D([_flat(finite)], colors=_COLOURS[name], radii=rr.Radius.ui_points(1.0))
+        self._file.static(f"{self._world}/path/{name}", line)
+
+    def _finish_path(self, frames: Ints, t_ns: Ints, raw: Floats, pose: Floats) -> None:
+        self._line("raw", raw[:, :2])
+        self._line("corrected", pose[:, :2])
+        extent = Extent.of(pose[:, :2])
+        good = np.isfinite(pose).all(axis=1)
+        self._file.scale_bar(extent)
+        vectors = ARROW_SHARE * extent.size_m * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
+        arrows = rr.Arrows3D.columns(vectors=_flat(vectors[good]), origins=_flat(pose[good, :2]))
+        self._file.static(
+            f"{self._world}/heading",
+            rr.Arrows3D.from_fields(colors=0xFFFFFFFF, radii=rr.Radius.ui_points(1.5)),
+        )
+        self._file.send(f"{self._world}/heading", frames[good], t_ns[good], arrows)
+        self._view(frames=(int(frames.min()), int(frames.max())), extent=extent)
+
+    def _view(self, **known: Any) -> None:
+        """Send the view again with what is known by now."""
+        self._bounds = dataclasses.replace(self._bounds, **known)
+        self._file.blueprint(blueprint_of(self._schema.step_type, self._run, self._estimator, self._bounds))
+
+
+def _number(value: str | float | int) -> str:
+    return f"{value:.6g}" if isinstance(value, float) else str(value)
+
+
+# ----------------------------------------------------------------------------- reading
+
+
+def read_steps(path: Path | str, run: str, step_type: type[Step]) -> list[Step]:
+    """The Steps of a run, from a finished file or from what a killed process left.
+
+    Every number is exactly the one that was logged, surfaces within the step of float16.
+
+    Raises:
+        RecordingError: the file cannot be read, or holds no such run.
+    """
+    schema = schema_of(step_type)
+    fields = [row.field for row in schema.rows]
+    return list(traces.rebuild(schema, read_fields(path, run, step_type, fields)))
+
+
+def read_fields(path: Path | str, run: str, step_type: type[Step], fields: Iterable[str]) -> dict[str, Sequence[Any]]:
+    """Some fields of a run's steps: one value per frame, in the order of the frames.
+
+    Raises:
+        RecordingError: the file cannot be read, or holds no such run.
+    """
+    schema = schema_of(step_type)
+    wanted = list(fields)
+    needed = schema.sharing({*wanted, "verdict", *(_SURFACE_NEEDS if "surface" in wanted else ())})
+    components = sorted({row.component for row in needed if row.component} | {_FORMAT})
+    rows = _whole_rows(_chunks(Path(path), f"/runs/{run}/**", components=components), needed)
+    frames, t_ns, _ = next(iter(rows.values()))
+    if not len(frames):
+        raise RecordingError(path, f"holds no steps of a run named {run!r}", "name a run of this file")
+    table: dict[str, Sequence[Any]] = {}
+    for entity, group in schema.of(Archetype.SCALARS).items():
+        if (entity, group[0].component) in rows:
+            table |= _split(schema, group, rows[entity, group[0].component][2])
+    for row in needed:
+        if row.archetype is Archetype.TIMELINE:
+            table[row.field] = {"frame": frames, "sensor_time": t_ns}[row.entity].tolist()
+        elif row.archetype is Archetype.INTEGERS:
+            table[row.field] = [int(value[0]) for value in rows[row.entity, row.component][2]]
+        elif row.archetype is Archetype.SURFACES:
+            formats = rows[row.entity, _FORMAT][2]
+            table[row.field] = _surfaces(rows[row.entity, row.component][2], formats, table)
+    return {field: table[field] for field in wanted}
+
+
+_FORMAT = "DepthImage:format"
+_SURFACE_NEEDS = ("fragment_px", "fragment_side_px")  # where each surface lies in the mosaic
+_Rows = tuple[Ints, Ints, list[Any]]
+
+
+def _whole_rows(chunks: Iterable[Any], needed: Iterable[Row]) -> dict[tuple[str, str], _Rows]:
+    """Frames, sensor times and values of each component, in the order of the frames.
+
+    Frames that lack a component are left out: they stood at the torn end of a file.
+    """
+    parts: dict[tuple[str, str], list[_Rows]] = {}
+    for row in needed:
+        if row.component:
+            parts[row.entity, row.component] = []
+        if row.archetype is Archetype.SURFACES:
+            parts[row.entity, _FORMAT] = []
+    entities = {entity for entity, _ in parts}
+    for chunk in chunks:
+        entity = chunk.entity_path.split("/", 4)[-1]  # below /runs/RUN/ESTIMATOR
+        if entity not in entities:
+            continue
+        batch = chunk.to_record_batch()
+        for component in batch.schema.names:
+            if (entity, component) in parts:
+                frames = batch.column("frame").to_numpy()
+                t_ns = batch.column("sensor_time").to_numpy().astype(np.int64)
+                parts[entity, component].append((frames, t_ns, _lists(batch.column(component))))
+    whole = functools.reduce(np.intersect1d, (_concatenated(part)[0] for part in parts.values()))
+    return {key: _only(whole, *_concatenated(part)) for key, part in parts.items()}
+
+
+def _concatenated(parts: Sequence[_Rows]) -> _Rows:
+    empty = np.empty(0, np.int64)
+    frames, t_ns = (np.concatenate([empty, *(part[i] for part in parts)]) for i in (0, 1))
+    return frames, t_ns, [value for part in parts for value in part[2]]
+
+
+def _only(whole: Ints, frames: Ints, t_ns: Ints, values: list[Any]) -> _Rows:
+    order = np.argsort(frames, kind="stable")
+    order = order[np.isin(frames[order], whole)]
+    return frames[order], t_ns[order], [values[i] for i in order]
+
+
+def _split(schema: Schema, rows: Sequence[Row], values: Sequence[Floats]) -> dict[str, list[Any]]:
+    """The rows of a group of scalars as the values of its fields."""
+    table: dict[str, list[Any]] = {}
+    start = 0
+    for row in rows:
+        shape = schema.shape(row.field)
+        fixed = [n for n in shape if isinstance(n, int)]
+        width = math.prod(fixed)
+        if len(fixed) < len(shape):
+            table[row.field] = [value.reshape(-1, *fixed) for value in values]
+        elif shape:
+            table[row.field] = [value[start : start + width].reshape(fixed) for value in values]
+        else:
+            table[row.field] = [value[start] for value in values]
+        start += width
+    return table
+
+
+def _surfaces(
+    buffers: Iterable[Any], formats: Iterable[Any], table: Mapping[str, Sequence[Any]]
+) -> list[NDArray[np.float32]]:
+    surfaces = []
+    fragments = zip(table["fragment_px"], table["fragment_side_px"], strict=True)
+    for buffer, (format_,), (px, side) in zip(buffers, formats, fragments, strict=True):
+        image = buffer.view(np.float16).reshape(format_["height"], format_["width"])
+        surfaces.append(traces.unmosaic(image, traces.cells(px, float(side))))
+    return surfaces
+
+
+def _lists(column: pa.ListArray) -> list[Any]:
+    """The rows of an Arrow column of lists: numpy arrays of numbers, else Python lists."""
+    kind = column.type.value_type
+    if pa.types.is_list(kind):
+        column, kind = column.flatten(), kind.value_type
+    if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
+        return list(column.to_pylist())
+    bounds = np.cumsum([0, *column.value_lengths().to_pylist()])
+    flat = column.flatten().to_numpy(zero_copy_only=False)
+    return [flat[a:b] for a, b in itertools.pairwise(bounds)]
+
+
+def _chunks(
+    path: Path, content: str, *, is_static: bool | None = False, components: Sequence[str] | None = None
+) -> Iterator[Any]:
+    """The chunks of some entities, also of a file without a footer or with a torn end."""
+    if not path.is_file():
+        raise RecordingError(path, "there is no such file", "give the path of an .rrd file")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            yield from _stream(path).filter(content=content, is_static=is_static, components=components)
+        except RuntimeError:
+            with tempfile.TemporaryDirectory() as folder:
+                fixed = Path(folder) / "recovered.rrd"
+                recover(path, fixed)
+                yield from _stream(fixed).filter(content=content, is_static=is_static, components=components)
+
+
+def _stream(path: Path) -> Any:
+    reader = RrdReader(path)
+    try:
+        return reader.store().stream()
+    except RuntimeError:
+        return reader.stream()
+
+
+# ------------------------------------------------------------------------- whole files
+
+
+_CURE = "give a file that a replay wrote"
+
+
+def merge(paths: Sequence[Path | str], out: Path | str) -> None:
+    """Join files of one mission into one portable file.
+
+    Raises:
+        RecordingError: a file cannot be read.
+    """
+    _tool(Path(paths[0]), "merge", *map(str, paths), "-o", str(out))
+
+
+def recover(path: Path | str, out: Path | str) -> None:
+    """Copy what is whole of an unfinished or torn file and write a footer.
+
+    Raises:
+        RecordingError: nothing can be read.
+    """
+    _tool(Path(path), "filter", str(path), "-o", str(out), "--continue-on-error")
+    if not RrdReader(out).recordings():
+        raise RecordingError(path, "is not a Rerun recording, or nothing of it is whole", _CURE)
+
+
+def _tool(path: Path, *arguments: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", *arguments], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+        raise RecordingError(path, f"cannot be read as a Rerun recording ({reason})", _CURE)
+
+
+def digest(path: Path | str) -> str:
+    """SHA-256 of a file's data, equal for equal data however the rows were cut into chunks.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    rows: dict[tuple[str, ...], list[bytes]] = {}
+    for chunk in _chunks(Path(path), "/**", is_static=None):
+        batch = chunk.to_record_batch()
+        names = sorted(name for name in batch.schema.names if not name.startswith("rerun.controls."))
+        for row in batch.select(names).to_pylist():
+            key = (chunk.entity_path, str([row.get(name) for name in ("frame", "sensor_time")]), *names)
+            rows.setdefault(key, []).append(hashlib.sha256(repr(row).encode()).digest())
+    total = hashlib.sha256()
+    for key in sorted(rows):
+        total.update(repr((key, rows[key])).encode())
+    return total.hexdigest()
