@@ -89,7 +89,8 @@ class ImageSample(Sample):
     name of a compressed format (``jpeg``, ``png``, ``tiff``, …). `width_px` and `height_px` are 0
     for compressed images whose header was not read. `step_bytes` and `big_endian` matter for raw
     encodings only. `payload` is the stored bytes, or a function that loads them; `source` names
-    where they come from (a file name, or topic and index) for messages.
+    where they come from (a file name, or topic and index) for messages. `frame` is the number of the
+    frame in its stream, -1 until a replay has counted it.
     """
 
     encoding: str
@@ -99,6 +100,7 @@ class ImageSample(Sample):
     step_bytes: int = 0
     big_endian: bool = False
     source: str = ""
+    frame: int = -1
 
     @property
     def data(self) -> bytes | memoryview:
@@ -250,11 +252,13 @@ class CameraInfo(Sample):
 class Problem(Sample):
     """A message that stood in the file and could not be made a sample; `reason` says why.
 
-    `Recording.read` yields it in place of the sample, so that a replay can give it a verdict.
+    `Recording.read` yields it in place of the sample, so that a replay can give it a verdict. `frame` is
+    the number of the frame in its stream where the message was an image, -1 until a replay has counted it.
     """
 
     kind: StreamKind
     reason: str
+    frame: int = -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -379,6 +383,13 @@ class Recording(abc.ABC):
             StreamError: a stream is not in the recording, or is listed as not readable.
             RecordingError: nothing more of the file can be read.
         """
+
+    def count_before(self, stream: str, t_ns: int) -> int:
+        """How many samples of `stream` lie before `t_ns`: the number of the first frame of a window.
+
+        Reads that part of the stream without decoding it; a reader that has an index can do better.
+        """
+        return sum(1 for _ in self.read([stream], None, t_ns))
 
     def close(self) -> None:  # noqa: B027 (most recordings hold nothing open)
         """Release the file; reading after this is an error."""
