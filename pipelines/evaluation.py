@@ -140,14 +140,17 @@ class Evaluation:
     `ape_m` and `ape_heading_rad` are those after `alignment`; `path_m` is the length of the estimate with the
     alignment's scale, `reference_path_m` that of the reference at the same times. `end_error_m` and `drift`
     (share of the reference's path) are those after laying the first poses over one another; `yaw_drift_rad` is
-    the change of the heading error from the first to the last pose. `index` [m] says which poses of the
-    estimate associate, `errors` [m, 4] are their errors after `alignment`: x, y, distance (m), heading (rad).
+    the change of the heading error from the first to the last pose. `fitted_scale` is the scale that least
+    squares find, whether or not `alignment` uses it, NaN where it is not determined. `index` [m] says which
+    poses of the estimate associate, `errors` [m, 4] are their errors after `alignment`: x, y, distance (m),
+    heading (rad).
     """
 
     matched: int
     total: int
     offset_ns: int
     alignment: Alignment
+    fitted_scale: float
     path_m: float
     reference_path_m: float
     ape_m: Statistics
@@ -192,7 +195,8 @@ def evaluate(
     index = np.flatnonzero(np.isfinite(at[:, 0]))
     _demand_enough(len(index), estimate, reference, offset_ns)
     truth, raw = at[index], estimate.pose[index]
-    alignment = align(raw, truth, with_scale=with_scale)
+    fitted = align(raw, truth, with_scale=True)
+    alignment = fitted if with_scale else align(raw, truth)
     aligned = alignment(raw)
     errors = _errors(aligned, truth)
     along = path_lengths(truth[:, :2])
@@ -209,6 +213,7 @@ def evaluate(
         total=len(estimate),
         offset_ns=offset_ns,
         alignment=alignment,
+        fitted_scale=fitted.scale if fitted.determined else math.nan,
         path_m=float(path_lengths(aligned[:, :2])[-1]),
         reference_path_m=length,
         ape_m=Statistics.of(errors[:, 2]),

@@ -14,7 +14,17 @@ from pydantic import BaseModel, ConfigDict
 
 from pipelines.estimator import Step, quantity
 from pipelines.verdict import Verdict
-from readers.streams import ImageError, ImageSample, Problem, Recording, Sample, StreamError, StreamInfo, StreamKind
+from readers.streams import (
+    ImageError,
+    ImageSample,
+    Problem,
+    RangeSample,
+    Recording,
+    Sample,
+    StreamError,
+    StreamInfo,
+    StreamKind,
+)
 
 SIZE = (3, 4)
 
@@ -133,3 +143,67 @@ class ToyEstimator:
             mean=mean,
             steps_before=state,
         )
+
+
+class WalkSettings(BaseModel):
+    """The settings of the walking estimator that concern the session."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+    metres_per_px: float | None = None
+    focal_px: float | None = None
+    height_m: float | None = None
+    height_stream: str = ""
+    height_offset_m: float = 0.0
+    start_pose: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    speed_px: float = 10.0
+
+    @classmethod
+    def presets(cls) -> tuple[str, ...]:
+        return ("best", "slow")
+
+    @classmethod
+    def preset(cls, name: str) -> WalkSettings:
+        return cls(speed_px={"best": 10.0, "slow": 5.0}[name])
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class WalkStep(Step):
+    accepted: bool = quantity("1", "whether the motion was measured")
+    pose: NDArray[np.float64] = quantity("m, m, rad", "x, y, heading", 3)
+
+
+class WalkingEstimator:
+    """Walks `speed_px` pixels a frame along its start heading, times the price of a pixel."""
+
+    name: ClassVar[str] = "toy"
+    step_type: ClassVar[type[Step]] = WalkStep
+    kinds: ClassVar[tuple[StreamKind, ...]] = (StreamKind.IMAGE, StreamKind.RANGE)
+
+    def __init__(self, settings: WalkSettings) -> None:
+        self.settings = settings
+
+    def start(self) -> tuple[int, float]:
+        return 0, self.settings.height_m or float("nan")
+
+    def step(self, state: tuple[int, float], sample: Sample, /) -> tuple[tuple[int, float], WalkStep | None]:
+        steps, height_m = state
+        if isinstance(sample, RangeSample):
+            return (steps, sample.range_m), None
+        if not isinstance(sample, ImageSample | Problem):
+            return state, None
+        s = self.settings
+        w = s.metres_per_px if s.metres_per_px is not None else height_m / (s.focal_px or float("nan"))
+        x, y, heading = s.start_pose
+        way = steps * s.speed_px * w
+        damaged = isinstance(sample, Problem)
+        verdict = Verdict.UNDECODABLE if damaged else Verdict.FIRST_FRAME if steps == 0 else Verdict.OK
+        step = WalkStep(
+            frame=sample.frame,
+            t_ns=sample.t_ns,
+            received_ns=sample.received_ns,
+            verdict=verdict,
+            alarms=verdict,
+            accepted=verdict is Verdict.OK,
+            pose=np.array([x + way * np.cos(heading), y + way * np.sin(heading), heading]),
+        )
+        return (steps + 1, height_m), step
