@@ -5,6 +5,7 @@ What is not asked for is chosen only where there is one possibility; every choic
 
 from __future__ import annotations
 
+import contextlib
 import datetime
 import hashlib
 import math
@@ -30,6 +31,7 @@ from readers.streams import (
     Problem,
     RangeSample,
     Recording,
+    RecordingError,
     Sample,
     ScalarSample,
     StreamError,
@@ -225,10 +227,16 @@ def load_reference(
         return Reference(stream, sentence)
     lower = None if start_ns is None else start_ns + offset_ns - MARGIN_NS
     upper = None if stop_ns is None else stop_ns + offset_ns + MARGIN_NS
-    poses = reference_poses(recording.read([stream], lower, upper))
+    poses = reference_poses(_while_readable(recording.read([stream], lower, upper)))
     if not poses:
         return Reference("", f"none: {stream} holds no position in this window")
     return Reference(stream, sentence, poses)
+
+
+def _while_readable(samples: Iterator[Sample]) -> Iterator[Sample]:
+    """Samples up to where the file can be read; that it ends there is for the replay to say, which reads it too."""
+    with contextlib.suppress(RecordingError):
+        yield from samples
 
 
 def reference_poses(samples: Iterator[Sample]) -> tuple[PoseSample, ...]:
