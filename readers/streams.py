@@ -90,7 +90,7 @@ class ImageSample(Sample):
     for compressed images whose header was not read. `step_bytes` and `big_endian` matter for raw
     encodings only. `payload` is the stored bytes, or a function that loads them; `source` names
     where they come from (a file name, or topic and index) for messages. `frame` is the number of the
-    frame in its stream, -1 until a replay has counted it.
+    image in its stream, which the replay sets; -1 before.
     """
 
     encoding: str
@@ -252,8 +252,7 @@ class CameraInfo(Sample):
 class Problem(Sample):
     """A message that stood in the file and could not be made a sample; `reason` says why.
 
-    `Recording.read` yields it in place of the sample, so that a replay can give it a verdict. `frame` is
-    the number of the frame in its stream where the message was an image, -1 until a replay has counted it.
+    `Recording.read` yields it in place of the sample, so that a replay can give it a verdict.
     """
 
     kind: StreamKind
