@@ -617,5 +617,6 @@ def _explain(error: Exception, debug: bool) -> int:
     if isinstance(error, OSError):
         _error(f"{error.filename or 'the system'}: {error.strerror or error}{where}")
         return REFUSED
-    _error(f"unexpected {type(error).__name__}: {error}{where}; --debug shows where")
+    first_line = (str(error).splitlines() or [""])[0]
+    _error(f"unexpected {type(error).__name__}: {first_line}{where}; --debug shows where")
     return FAULT

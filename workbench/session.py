@@ -49,6 +49,7 @@ from workbench.summary import Tally, evaluation_values, lines, suitability
 
 PACKAGES = ("estimator-workbench", "rerun-sdk", "numpy", "numba", "scipy", "opencv-python-headless", "rosbags", "mcap")
 FORMAT = 1
+CALIBRATION_AGREES = 0.05
 
 
 # -------------------------------------------------------------------------------- request
@@ -607,12 +608,10 @@ def calibration(settings: Any, evaluation: Evaluation) -> dict[str, Any]:
     by_length = evaluation.alignment.scale * evaluation.reference_path_m / evaluation.path_m
     factors = evaluation.fitted_scale, by_length
     fit, ratio = (used * f if key == "metres_per_px" else used / f for f in factors)
-    return {
-        "key": key,
-        "least_squares": fit,
-        "path_ratio": ratio,
-        "sentence": f"{key} = {fit:.6g} by least squares, {ratio:.6g} by path length; use --set {key}={fit:.6g}",
-    }
+    sentence = f"{key} = {fit:.6g} by least squares, {ratio:.6g} by path length; use --set {key}={fit:.6g}"
+    if abs(ratio / fit - 1) > CALIBRATION_AGREES:
+        sentence += ", with care: the two do not agree, so that the path's shape is wrong, not only its scale"
+    return {"key": key, "least_squares": fit, "path_ratio": ratio, "sentence": sentence}
 
 
 def tum_line(t_ns: int, pose: Floats) -> str:

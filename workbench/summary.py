@@ -12,12 +12,14 @@ from pipelines.evaluation import Evaluation, Relative, Statistics
 from pipelines.verdict import Severity, Verdict, flags
 
 NOTABLE_SHARE = 0.05
+TRUSTED_SHARE = 0.5
+MOST_CAUSES = 6
 SLOW_FRAMES_S = 0.5
 
 ADVICE: Mapping[Verdict, str] = {
     Verdict.DUPLICATE_FRAME: "the log repeats frames; they carry no motion",
     Verdict.FRAME_GAP: "frames are missing in the log, or its stamps are irregular",
-    Verdict.HEIGHT_CHANGE: "the camera's height is not constant: give a height stream, else the scale is wrong",
+    Verdict.HEIGHT_CHANGE: "the camera's height is not constant: without a height stream the scale is wrong",
     Verdict.EXPOSURE_JUMP: "the brightness changes from frame to frame: fix the exposure, or set gain_and_offset",
     Verdict.BLURRED: "motion blur: a shorter exposure is needed",
     Verdict.PEAK_AMBIGUOUS: "the surface repeats itself: a match one period away looks as good as the right one",
@@ -71,23 +73,30 @@ def name_of(verdict: Verdict) -> str:
 
 
 def suitability(tally: Tally, median_dt_s: float) -> list[str]:
-    """Plain sentences on how far the method suits the recording, gravest first."""
+    """Plain sentences on how far the method suits the recording: the upshot first, then the gravest causes."""
     if tally.frames < 2:
         return ["fewer than two frames: there is no motion to estimate"]
-    sentences = []
-    for verdict in sorted(ADVICE, key=lambda v: (v.severity, tally.alarms[v]), reverse=True):
-        share = tally.alarms[verdict] / tally.frames
-        if share >= NOTABLE_SHARE:
-            sentences.append(f"{percent(share)} of the frames {name_of(verdict)}: {ADVICE[verdict]}")
+    causes = []
     if median_dt_s > SLOW_FRAMES_S:
-        sentences.append(
+        causes.append(
             f"median time between frames {median_dt_s:.3g} s: the method expects frames that overlap by far, "
             "as at video rate; between distant frames its motion prediction has nothing to go by"
         )
-    used = tally.used / (tally.frames - 1)
+    for verdict in sorted(ADVICE, key=lambda v: (v.severity, tally.alarms[v]), reverse=True):
+        share = tally.alarms[verdict] / tally.frames
+        if share >= NOTABLE_SHARE:
+            causes.append(f"{percent(share)} of the frames {name_of(verdict)}: {ADVICE[verdict]}")
+    return [_upshot(tally.used / (tally.frames - 1), bool(causes)), *causes[:MOST_CAUSES]]
+
+
+def _upshot(used: float, doubts: bool) -> str:
+    """How much of the path was measured, in one sentence."""
+    measured = f"{percent(min(used, 1.0))} of the motions were measured"
+    if used < TRUSTED_SHARE:
+        return f"do not trust this path: only {measured}, the others hold the last velocity"
     if used < 1 - NOTABLE_SHARE:
-        sentences.insert(0, f"only {percent(used)} of the motions were measured; the others hold the last velocity")
-    return sentences or [f"{percent(used)} of the motions were measured; nothing speaks against the method here"]
+        return f"only {measured}, the others hold the last velocity"
+    return f"{measured}, but look at what follows" if doubts else f"{measured}; nothing speaks against the method here"
 
 
 def percent(share: float) -> str:
