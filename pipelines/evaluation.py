@@ -207,7 +207,7 @@ def evaluate(
     relative = [relative_error(aligned, truth, along, delta, "m") for delta in rpe_m]
     relative += [relative_error(aligned, truth, seconds, delta, "s") for delta in rpe_s]
     end_error = end_point_error(raw, truth, alignment)
-    yaw_drift = wrap_angle(errors[-1, 3] - errors[0, 3])
+    yaw_drift = _growth(errors[:, 3])
     return Evaluation(
         matched=len(index),
         total=len(estimate),
@@ -376,6 +376,12 @@ def _mean_angle(angles_rad: Floats) -> float:
     """Circular mean of the known ones among some angles, 0 of none."""
     known = angles_rad[np.isfinite(angles_rad)]
     return math.atan2(float(np.sin(known).sum()), float(np.cos(known).sum())) if len(known) else 0.0
+
+
+def _growth(angles_rad: Floats) -> float:
+    """How far an angle has turned from the first known value to the last one, whole turns included."""
+    known = np.unwrap(angles_rad[np.isfinite(angles_rad)])
+    return float(known[-1] - known[0]) if len(known) else math.nan
 
 
 def _motion(pose: Floats, i: NDArray[np.intp], j: NDArray[np.intp]) -> Floats:

@@ -283,6 +283,12 @@ def test_yaw_drift_is_a_change_and_not_an_offset() -> None:
     assert result.yaw_drift_rad_per_m == pytest.approx(0.01)
 
 
+def test_yaw_drift_counts_whole_turns() -> None:
+    reference = line([n / 10 for n in range(101)])
+    estimate = Trajectory(reference.t_ns, reference.pose + np.linspace([0, 0, 0.0], [0, 0, 7.0], 101))
+    assert evaluate(estimate, reference).yaw_drift_rad == pytest.approx(7.0)
+
+
 def test_errors_are_rows_of_the_matched_frames() -> None:
     estimate, reference = random_pair(4)
     late = Trajectory(reference.t_ns[20:], reference.pose[20:])
