@@ -55,8 +55,12 @@ class Estimator(Protocol[StateT]):
     """
 
     name: ClassVar[str]
-    step_type: ClassVar[type[Step]]
     kinds: ClassVar[tuple[StreamKind, ...]]
+
+    @property
+    def step_type(self) -> type[Step]:
+        """The class of this estimator's steps."""
+        ...
 
     @property
     def settings(self) -> BaseModel:

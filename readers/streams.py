@@ -386,6 +386,13 @@ class Recording(abc.ABC):
             RecordingError: nothing more of the file can be read.
         """
 
+    def count_before(self, stream: str, t_ns: int) -> int:
+        """How many samples of `stream` lie before `t_ns`: the number of the first frame of a window.
+
+        Reads that part of the stream without decoding it; a reader that has an index can do better.
+        """
+        return sum(1 for _ in self.read([stream], None, t_ns))
+
     def close(self) -> None:  # noqa: B027 (most recordings hold nothing open)
         """Release the file; reading after this is an error."""
 

@@ -1,0 +1,622 @@
+"""The commands: inspect, replay, view, demo, settings. The only module that prints.
+
+What a command concludes goes to stdout, progress and errors to stderr. Exit status: 0 done; 2 a request that
+cannot be met (one line says why); 3 the recording could be read only in part; 130 interrupted; 1 a fault of the
+workbench itself. Everything heavy is imported inside the commands, so that help comes at once.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import subprocess
+import sys
+import time
+import traceback
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from pathlib import Path
+from types import TracebackType
+from typing import TYPE_CHECKING, Annotated, Any, Self
+
+import typer
+
+if TYPE_CHECKING:
+    from readers.streams import Camera, ReadOptions, Recording, StreamInfo
+    from workbench.session import Outcome, Progress, Request
+
+REFUSED, IN_PART, INTERRUPTED, FAULT = 2, 3, 130, 1
+EPOCH_NS = 100_000_000_000_000_000
+WIDEST = 60
+BAR_SECONDS = 0.1
+LINE_SECONDS = 5.0
+
+app = typer.Typer(
+    name="workbench",
+    help="Replay a mission's log through odometry and see, frame by frame, what the estimator concluded and why.\n\n"
+    "\b\nFirst steps:\n"
+    "  workbench demo                     replay the built-in recording\n"
+    "  workbench inspect mission.bag      what is in a log, and what is odd about it\n"
+    "  workbench replay mission.bag       replay it; the result lies in results/mission/\n"
+    "  workbench view results/mission     look at the result\n\n"
+    "Every command explains itself with --help. A fault is one line on stderr; --debug adds where it arose.",
+    no_args_is_help=False,
+    add_completion=False,
+    rich_markup_mode=None,
+    pretty_exceptions_enable=False,
+)
+
+RecordingPath = Annotated[
+    Path, typer.Argument(metavar="PATH", help="ROS 1 bag, ROS 2 bag, MCAP, image folder or video", show_default=False)
+]
+Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Frame rate of images without times.")]
+TimesFile = Annotated[Path | None, typer.Option("--times", metavar="FILE", help="File with the times of the frames.")]
+TimesUnit = Annotated[str, typer.Option("--times-unit", metavar="UNIT", help="Unit in it: s, ms, us, ns or auto.")]
+TimeFrames = Annotated[
+    list[str] | None,
+    typer.Option("--tf", metavar="PARENT,CHILD", help="Pair of frames in /tf to read as a pose stream; repeatable."),
+]
+AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
+
+
+@app.callback()
+def _common(
+    debug: Annotated[
+        bool, typer.Option("--debug", help="Show where an error arose; works after a command, too.")
+    ] = False,
+) -> None:
+    """Options before the command; `main` has taken ``--debug`` out by now."""
+
+
+# -------------------------------------------------------------------------------- inspect
+
+
+@app.command(short_help="What is in a recording, and what is odd about it.")
+def inspect(
+    path: RecordingPath,
+    as_json: AsJson = False,
+    quick: Annotated[bool, typer.Option("--quick", help="Do not read the messages to count oddities.")] = False,
+    rate: Rate = None,
+    times: TimesFile = None,
+    times_unit: TimesUnit = "auto",
+    tf: TimeFrames = None,
+) -> None:
+    r"""Show what is in a recording: streams, cameras, damage, and what is odd about its clocks.
+
+    \b
+    Examples:
+      workbench inspect mission.bag
+      workbench inspect frames/ --rate 30
+      workbench inspect mission.mcap --json | jq '.streams[].name'
+    """
+    from workbench.session import open_any
+
+    with open_any(path, _options(rate, times, times_unit, tf)) as recording:
+        facts = [] if quick else _survey(recording)
+        values = _recording_values(recording, facts)
+        if as_json:
+            _print_json(values)
+        else:
+            _print_recording(recording, values)
+
+
+def _survey(recording: Recording) -> list[dict[str, Any]]:
+    from readers.clock import survey
+
+    return [
+        {"stream": fact.stream, "code": fact.code, "count": fact.count, "sentence": fact.sentence}
+        for fact in survey(recording)
+    ]
+
+
+def _recording_values(recording: Recording, facts: list[dict[str, Any]]) -> dict[str, Any]:
+    """A recording as plain values."""
+    return {
+        "path": str(recording.path),
+        "format": recording.format,
+        "streams": [_stream_values(info) for info in recording.streams],
+        "cameras": {name: _camera_values(camera) for name, camera in recording.cameras.items()},
+        "notes": list(recording.notes),
+        "damage": [str(damage) for damage in recording.damage],
+        "facts": facts,
+    }
+
+
+def _stream_values(info: StreamInfo) -> dict[str, Any]:
+    return {
+        "name": info.name,
+        "kind": str(info.kind),
+        "type": info.type,
+        "encoding": info.encoding,
+        "count": None if info.count < 0 else info.count,
+        "first_ns": None if info.first_ns < 0 else info.first_ns,
+        "last_ns": None if info.last_ns < 0 else info.last_ns,
+        "rate_hz": info.rate_hz,
+        "frame": info.frame,
+        "readable": info.readable,
+        "reason": info.reason,
+    }
+
+
+def _camera_values(camera: Camera) -> dict[str, Any]:
+    return {
+        "width_px": camera.width_px,
+        "height_px": camera.height_px,
+        "matrix": camera.matrix.tolist(),
+        "distortion_model": camera.distortion_model,
+        "distortion": camera.distortion.tolist(),
+        "frame": camera.frame,
+        "calibrated": camera.calibrated,
+    }
+
+
+def _print_recording(recording: Recording, values: Mapping[str, Any]) -> None:
+    """Print a recording for people."""
+    print(f"{shown(values['path'])}: {shown(values['format'])}")
+    times = [info.first_ns for info in recording.streams if info.first_ns >= 0]
+    origin_ns = min(times, default=0)
+    if times:
+        last_ns = max(info.last_ns for info in recording.streams)
+        print(f"from {moment(origin_ns)} for {(last_ns - origin_ns) / 1e9:.3f} s (log time)")
+    print()
+    heads = ("stream", "kind", "messages", "Hz", "from s", "to s", "frame", "type")
+    rows = [_stream_row(info, origin_ns) for info in recording.streams]
+    print("\n".join(table(heads, rows, right=(2, 3, 4, 5))) if rows else "no streams")
+    for name, camera in recording.cameras.items():
+        print(f"\ncamera of {shown(name)}: {_camera_text(camera)}")
+    _print_list("notes", values["notes"])
+    _print_list("not readable", [f"{i.name}: {i.reason}" for i in recording.streams if not i.readable])
+    _print_list("damage", values["damage"])
+    _print_list("oddities", [f"{fact['stream']}: {fact['sentence']}" for fact in values["facts"]])
+
+
+def _stream_row(info: StreamInfo, origin_ns: int) -> tuple[str, ...]:
+    empty = info.first_ns < 0
+    return (
+        info.name,
+        str(info.kind),
+        "?" if info.count < 0 else str(info.count),
+        "" if info.rate_hz != info.rate_hz else f"{info.rate_hz:.4g}",
+        "" if empty else f"{(info.first_ns - origin_ns) / 1e9:.3f}",
+        "" if empty else f"{(info.last_ns - origin_ns) / 1e9:.3f}",
+        info.frame,
+        info.type + ("" if not info.encoding else f" ({info.encoding})"),
+    )
+
+
+def _camera_text(camera: Camera) -> str:
+    size = f"{camera.width_px} x {camera.height_px} px"
+    if not camera.calibrated:
+        return f"{size}, not calibrated"
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    return f"{size}, f {fx:.6g} {fy:.6g}, centre {cx:.6g} {cy:.6g}, distortion {shown(camera.distortion_model)}"
+
+
+# --------------------------------------------------------------------------------- replay
+
+
+@app.command(short_help="Replay a recording; write all that was computed.")
+def replay(
+    path: RecordingPath,
+    estimator: Annotated[str, typer.Option("--estimator", "-e", help="Name of the estimator.")] = "correlation",
+    preset: Annotated[str | None, typer.Option(help="Preset of its settings, such as best or paper-a.")] = None,
+    settings: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="Settings over the preset: TOML, JSON, or a RUN.toml.")
+    ] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting over all; repeatable.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option("--from", metavar="T", help="Begin: seconds after the first frame, ns, or ISO 8601.")
+    ] = None,
+    stop: Annotated[str | None, typer.Option("--to", metavar="T", help="End (excluded), likewise.")] = None,
+    stride: Annotated[int, typer.Option(help="Use every n-th frame.")] = 1,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="DIR", help="Folder of the results [results/NAME].")
+    ] = None,
+    name: Annotated[str | None, typer.Option(help="Name of the run [the preset's].")] = None,
+    image: Annotated[str | None, typer.Option(metavar="TOPIC", help="Image stream [the only one].")] = None,
+    reference: Annotated[
+        str | None,
+        typer.Option(metavar="TOPIC", help="Pose, GNSS or odometry stream to compare with, or none [the only one]."),
+    ] = None,
+    reference_offset: Annotated[
+        float, typer.Option(metavar="S", help="Seconds to add to the frames' times to find the reference.")
+    ] = 0.0,
+    height: Annotated[
+        str | None, typer.Option(metavar="TOPIC", help="Range, number or pose (z) stream of the camera's height.")
+    ] = None,
+    calibrate_scale: Annotated[
+        bool, typer.Option("--calibrate-scale", help="Tell the scale that fits the reference best.")
+    ] = False,
+    raw_images: Annotated[str, typer.Option(metavar="FORM", help="Keep raw images as png or raw.")] = "png",
+    rate: Rate = None,
+    times: TimesFile = None,
+    times_unit: TimesUnit = "auto",
+    tf: TimeFrames = None,
+    as_json: AsJson = False,
+) -> None:
+    r"""Replay a recording through an estimator; write all it computed, and a summary.
+
+    The folder of the results then holds sensors.rrd, RUN.rrd, RUN.toml (settings, versions, summary) and RUN.tum
+    (trajectory). Ctrl-C ends the replay early and loses nothing.
+
+    \b
+    Examples:
+      workbench replay mission.bag
+      workbench replay mission.bag --preset paper-a --from 10 --to 20
+      workbench replay mission.bag --set search_radius_px=16 --name wide
+      workbench replay mission.bag --set metres_per_px=0.00078
+      workbench replay mission.bag --height /lidar/range --reference /mocap/pose
+      workbench replay frames/ --rate 60 --times times.txt --json
+    """
+    from workbench.session import Request
+
+    request = Request(
+        path=path,
+        estimator=estimator,
+        preset=preset,
+        settings_file=settings,
+        overrides=tuple(overrides or ()),
+        start=start,
+        stop=stop,
+        stride=stride,
+        out=out,
+        name=name,
+        image=image,
+        reference=reference,
+        reference_offset_s=reference_offset,
+        height=height,
+        options=_options(rate, times, times_unit, tf),
+        calibrate_scale=calibrate_scale,
+        raw_images=_one_of(raw_images, ("png", "raw"), "--raw-images"),
+    )
+    outcome = _replay(request)
+    if as_json:
+        _print_json(outcome.summary | {"folder": str(outcome.folder), "files": _files(outcome)})
+    else:
+        _print_summary(outcome)
+    raise typer.Exit(_status(outcome))
+
+
+def _replay(request: Request) -> Outcome:
+    from workbench.session import run
+
+    with _Bar(request.name or request.preset or request.estimator) as bar:
+        return run(request, on_progress=bar)
+
+
+def _status(outcome: Outcome) -> int:
+    """The exit status that an outcome deserves."""
+    summary = outcome.summary
+    if summary["interrupted"]:
+        return INTERRUPTED
+    if summary["stopped_early"]:
+        _error(summary["stopped_early"])
+        return IN_PART
+    calibration = summary["calibration"]
+    if calibration is not None and not calibration["key"]:
+        _error(f"--calibrate-scale: {calibration['sentence']}")
+        return REFUSED
+    return 0
+
+
+def _files(outcome: Outcome) -> list[str]:
+    run = outcome.run_file
+    return [str(f) for f in (outcome.sensors_file, run, run.with_suffix(".toml"), run.with_suffix(".tum"))]
+
+
+def _print_summary(outcome: Outcome) -> None:
+    from workbench.summary import lines
+
+    rows = lines(outcome.summary)
+    width = max(len(name) for name, _ in rows)
+    before = ""
+    for name, text in rows:
+        print(f"{'' if name == before else name:<{width}}  {shown(text, None)}")
+        before = name
+    print(f"{'result':<{width}}  {outcome.run_file}")
+    print(f"{'look at it':<{width}}  workbench view {outcome.run_file}")
+
+
+# ----------------------------------------------------------------------------------- view
+
+
+@app.command(short_help="Look at one or several runs in the Rerun viewer.")
+def view(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="RUN.rrd files, or folders of results", show_default=False)
+    ],
+    web: Annotated[bool, typer.Option("--web", help="Show it in the browser, served on this machine only.")] = False,
+) -> None:
+    r"""Open the Rerun viewer with one or several runs and the images that belong to them.
+
+    Without a display the command that would open it is printed.
+
+    \b
+    Examples:
+      workbench view results/mission
+      workbench view results/mission/best.rrd results/mission/paper-a.rrd
+      workbench view results/mission --web
+    """
+    command = view_command(files_of(runs), web=web)
+    if not web and not _has_display():
+        import shlex
+
+        print("There is no display here. On a machine with one, with these files:", file=sys.stderr)
+        print(shlex.join(["rerun", *command[3:]]))
+        return
+    raise typer.Exit(subprocess.run(command, check=False).returncode)
+
+
+def files_of(runs: Sequence[Path]) -> list[Path]:
+    """The files to open for some runs: the sensors of their missions first, no file twice.
+
+    Raises:
+        RecordingError: a run is missing, or a folder holds none.
+    """
+    from readers.streams import RecordingError
+
+    chosen: list[Path] = []
+    for run in runs:
+        if not run.exists():
+            raise RecordingError(run, "there is no such run", "give the RUN.rrd, or its folder, of a replay")
+        folder = run if run.is_dir() else run.parent
+        found = sorted(run.glob("*.rrd")) if run.is_dir() else [run.with_suffix(".rrd")]
+        if not found or not all(file.is_file() for file in found):
+            raise RecordingError(run, "there is no .rrd file", "give the RUN.rrd, or its folder, of a replay")
+        sensors = folder / "sensors.rrd"
+        chosen += [sensors] if sensors.is_file() else []
+        chosen += found
+    unique = list(dict.fromkeys(chosen))
+    return sorted(unique, key=lambda file: file.name != "sensors.rrd")
+
+
+def view_command(files: Sequence[Path], *, web: bool) -> list[str]:
+    """The command that opens the viewer on these files, reachable from this machine only."""
+    command = [sys.executable, "-m", "rerun", *map(str, files), "--bind", "127.0.0.1"]
+    return [*command, "--web-viewer"] if web else command
+
+
+def _has_display() -> bool:
+    if sys.platform != "linux":
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+# ----------------------------------------------------------------------------------- demo
+
+
+@app.command(short_help="Replay the built-in recording.")
+def demo(
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of the results.")] = Path(
+        "results/demo"
+    ),
+    as_json: AsJson = False,
+) -> None:
+    r"""Replay the built-in recording with both presets and say how to look at the result.
+
+    \b
+    Example:
+      workbench demo && workbench view results/demo
+    """
+    from workbench.session import Request
+
+    path = demo_recording()
+    outcomes = []
+    for preset in ("best", "paper-a"):
+        outcome = _replay(Request(path=path, preset=preset, out=out))
+        outcomes.append(outcome)
+        if not as_json:
+            _print_summary(outcome)
+            print()
+        if status := _status(outcome):
+            raise typer.Exit(status)
+    if as_json:
+        _print_json({"folder": str(out), "runs": {o.summary["run"]: o.summary for o in outcomes}})
+        return
+    print(f"Both runs lie in {out}. Look at them, one over the other, with:\n  workbench view {out}")
+
+
+def demo_recording() -> Path:
+    """The recording that comes with the source.
+
+    Raises:
+        RecordingError: it is not there.
+    """
+    from readers.streams import RecordingError
+
+    path = Path(__file__).resolve().parents[1] / "recordings" / "demo.mcap"
+    if not path.is_file():
+        raise RecordingError(
+            path, "the built-in recording is missing", "install from a checkout of the source with pip install -e ."
+        )
+    return path
+
+
+# ------------------------------------------------------------------------------- settings
+
+
+@app.command(short_help="Print the settings of a preset as a settings file.")
+def settings(
+    estimator: Annotated[str, typer.Option("--estimator", "-e", help="Name of the estimator.")] = "correlation",
+    preset: Annotated[str | None, typer.Option(help="Preset of its settings.")] = None,
+) -> None:
+    r"""Print the settings of a preset as a settings file, each with what it is.
+
+    \b
+    Example:
+      workbench settings --preset paper-a > mine.toml
+      workbench replay mission.bag --settings mine.toml
+    """
+    from workbench.settings import described, plugin, settings_values, to_toml
+
+    chosen = plugin(estimator)
+    name = preset or chosen.usual_preset
+    values = settings_values(chosen.preset(name))
+    print(f"# {estimator}, preset {name}; all presets: {', '.join(chosen.presets)}")
+    for key, meaning in described(chosen.settings):
+        if meaning:
+            print(f"# {meaning}")
+        print(to_toml({key: values[key]}).strip() if values[key] is not None else f"# {key} is not set")
+
+
+# -------------------------------------------------------------------------------- helpers
+
+
+def _options(rate: float | None, times: Path | None, unit: str, frames: Sequence[str] | None) -> ReadOptions:
+    from readers.streams import ReadOptions, StreamError
+
+    if rate is not None and not 0 < rate < float("inf"):
+        raise StreamError(f"--rate {rate:g}: a frame rate is a positive number of frames per second")
+    pairs = []
+    for text in frames or ():
+        parent, comma, child = text.partition(",")
+        if not (comma and parent and child):
+            raise StreamError(f"--tf {text}: write two frames with a comma, for example --tf map,base_link")
+        pairs.append((parent.strip(), child.strip()))
+    return ReadOptions(
+        rate_hz=rate,
+        times_file=times,
+        times_unit=_one_of(unit, ("auto", "s", "ms", "us", "ns"), "--times-unit"),
+        pose_frames=tuple(pairs),
+    )
+
+
+def _one_of(text: str, known: Sequence[str], option: str) -> str:
+    from workbench.settings import SettingsError
+
+    if text not in known:
+        raise SettingsError(f"{option} {text}: must be one of {', '.join(known)}")
+    return text
+
+
+def shown(text: str, widest: int | None = 400) -> str:
+    """A text from a file, safe for a terminal: control characters escaped, at most `widest` characters."""
+    safe = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return safe if widest is None or len(safe) <= widest else f"{safe[: widest - 1]}…"
+
+
+def moment(t_ns: int) -> str:
+    """A time as a date (UTC) where it can be one, else in seconds."""
+    if t_ns < EPOCH_NS:
+        return f"{t_ns / 1e9:.3f} s"
+    seconds, rest = divmod(t_ns, 1_000_000_000)
+    return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(seconds)) + f".{rest // 1_000_000:03d} UTC"
+
+
+def table(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> list[str]:
+    """Lines of a table with columns as wide as their longest entry; the last one is not padded."""
+    cells = [tuple(heads), *(tuple(shown(cell, WIDEST) for cell in row) for row in rows)]
+    widths = [max(len(row[k]) for row in cells) for k in range(len(heads))]
+    return [
+        "  ".join(
+            c.rjust(w) if k in right else c.ljust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))
+        ).rstrip()
+        for row in cells
+    ]
+
+
+def _print_list(title: str, texts: Sequence[str]) -> None:
+    if texts:
+        print(f"\n{title}:")
+        for text in texts:
+            print(f"  {shown(text)}")
+
+
+def _print_json(values: Mapping[str, Any]) -> None:
+    from workbench.summary import without_nan
+
+    print(json.dumps(without_nan(values), indent=2, ensure_ascii=True, allow_nan=False))
+
+
+class _Bar:
+    """Progress on stderr: a bar with the time left on a terminal, else a line every few seconds."""
+
+    def __init__(self, title: str) -> None:
+        self._title = title
+        self._live: Any = None
+        self._task: Any = None
+        self._told = time.monotonic()
+        self._began = self._told
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._live is not None:
+            self._live.stop()
+
+    def __call__(self, progress: Progress) -> None:
+        """Take note of a frame; show it if the last time is long enough ago."""
+        now = time.monotonic()
+        terminal = sys.stderr.isatty()
+        if now - self._told < (BAR_SECONDS if terminal else LINE_SECONDS) and progress.done != progress.total:
+            return
+        self._told = now
+        if terminal:
+            self._draw(progress)
+        else:
+            of = "" if progress.total is None else f" of {progress.total}"
+            speed = progress.done / max(now - self._began, 1e-9)
+            print(f"{self._title}: frame {progress.done}{of}, {speed:.0f} frames/s", file=sys.stderr, flush=True)
+
+    def _draw(self, progress: Progress) -> None:
+        if self._live is None:
+            from rich.console import Console
+            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
+            from rich.progress import Progress as Live
+
+            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
+            self._live = Live(*columns, console=Console(stderr=True))
+            self._live.start()
+            self._task = self._live.add_task(self._title, total=progress.total)
+        self._live.update(self._task, completed=progress.done)
+
+
+def _error(text: str) -> None:
+    print(f"error: {shown(text, None)}", file=sys.stderr, flush=True)
+
+
+# ----------------------------------------------------------------------------------- main
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run one command; return its exit status, with one line on stderr for every fault."""
+    given = list(sys.argv[1:] if arguments is None else arguments) or ["--help"]
+    debug = "--debug" in given
+    call: Callable[..., Any] = app
+    try:
+        status = call([a for a in given if a != "--debug"], prog_name="workbench", standalone_mode=False)
+    except KeyboardInterrupt:
+        return INTERRUPTED
+    except SystemExit as stop:
+        return stop.code if isinstance(stop.code, int) else FAULT
+    except Exception as error:
+        return _explain(error, debug)
+    return status if isinstance(status, int) else 0
+
+
+def _explain(error: Exception, debug: bool) -> int:
+    """Print an error as one line and return the exit status that it deserves."""
+    from readers.streams import WorkbenchError
+
+    if debug:
+        traceback.print_exception(error)
+    if type(error).__name__ == "Abort":
+        return INTERRUPTED
+    where = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
+    usage = getattr(error, "format_message", None)  # of the command line's own errors
+    if usage is not None:
+        _error(usage() or "a command is missing; see workbench --help")
+        return REFUSED
+    if isinstance(error, WorkbenchError):
+        _error(f"{error}{where}")
+        return REFUSED
+    if isinstance(error, OSError):
+        _error(f"{error.filename or 'the system'}: {error.strerror or error}{where}")
+        return REFUSED
+    first_line = (str(error).splitlines() or [""])[0]
+    _error(f"unexpected {type(error).__name__}: {first_line}{where}; --debug shows where")
+    return FAULT

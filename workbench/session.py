@@ -1,0 +1,665 @@
+"""One replay, from a path to a run folder: open, choose, replay, judge, write.
+
+The run folder holds, once per mission, `sensors.rrd` (with `sensors.toml`, which says what is in it), and per
+run `RUN.rrd`, `RUN.toml` (settings, versions, input digest, window, summary) and `RUN.tum` (trajectory).
+An interrupt is noticed between two frames; everything up to there is written, the files are closed, and
+RUN.toml says so. Nothing of the wall clock goes into the files.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import importlib.metadata
+import math
+import platform
+import re
+import signal
+import threading
+import tomllib
+from array import array
+from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from types import FrameType
+from typing import Any, NamedTuple, Protocol, Self, TextIO
+
+import numpy as np
+
+from pipelines.estimator import Estimator, Step
+from pipelines.evaluation import Evaluation, EvaluationError, Trajectory, evaluate, path_lengths
+from pipelines.geometry import Floats
+from pipelines.replay import Replayed, replay
+from pipelines.verdict import Severity
+from readers.clock import StreamAudit
+from readers.streams import (
+    ImageError,
+    ImageSample,
+    PoseSample,
+    Problem,
+    ReadOptions,
+    Recording,
+    RecordingError,
+    Sample,
+    StreamError,
+    StreamInfo,
+)
+from workbench import inputs
+from workbench.settings import Plugin, Resolved, SettingsError, plugin, resolve, settings_values, to_toml
+from workbench.summary import Tally, evaluation_values, lines, suitability
+
+PACKAGES = ("estimator-workbench", "rerun-sdk", "numpy", "numba", "scipy", "opencv-python-headless", "rosbags", "mcap")
+FORMAT = 1
+CALIBRATION_AGREES = 0.05
+
+
+# -------------------------------------------------------------------------------- request
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Request:
+    """What a user asks of one replay.
+
+    `start` and `stop` are times as `inputs.parse_time` reads them; `image`, `reference` and `height` are names
+    of streams, ``none`` for no reference or height; `reference_offset_s` is added to the frames' times before
+    the reference is looked up; `raw_images` says how images without a viewable stored form are kept.
+    """
+
+    path: Path
+    estimator: str = "correlation"
+    preset: str | None = None
+    settings_file: Path | None = None
+    overrides: tuple[str, ...] = ()
+    start: str | None = None
+    stop: str | None = None
+    stride: int = 1
+    out: Path | None = None
+    name: str | None = None
+    image: str | None = None
+    reference: str | None = None
+    reference_offset_s: float = 0.0
+    height: str | None = None
+    options: ReadOptions = field(default_factory=ReadOptions)
+    calibrate_scale: bool = False
+    raw_images: str = "png"
+
+
+@dataclass(frozen=True, slots=True)
+class Outcome:
+    """What became of a replay: its files and its summary, which is the table ``summary`` of RUN.toml."""
+
+    folder: Path
+    run_file: Path
+    sensors_file: Path
+    summary: dict[str, Any]
+
+
+@dataclass(frozen=True, slots=True)
+class Progress:
+    """How far a replay is: frames done, frames in all (None if unknown), sensor time of the last one."""
+
+    done: int
+    total: int | None
+    t_ns: int
+
+
+# -------------------------------------------------------------------------------- writers
+
+
+class SensorLog(Protocol):
+    """What the session needs of `workbench.rrd.SensorWriter`."""
+
+    def image(self, frame: int, sample: ImageSample) -> None: ...  # noqa: D102
+    def undecodable(self, frame: int, t_ns: int, reason: str) -> None: ...  # noqa: D102
+    def reference(self, poses: Sequence[PoseSample]) -> None: ...  # noqa: D102
+    def facts(self, lines: Sequence[str]) -> None: ...  # noqa: D102
+    def close(self) -> None: ...  # noqa: D102
+
+
+class RunLog(Protocol):
+    """What the session needs of `workbench.rrd.RunWriter`."""
+
+    def step(self, step: Step) -> None: ...  # noqa: D102
+    def event(self, frame: int, t_ns: int, severity: Severity, text: str) -> None: ...  # noqa: D102
+    def errors(self, frames: Any, t_ns: Any, values: Floats) -> None: ...  # noqa: D102
+    def finish(self, summary: Mapping[str, str | float | int], aligned_path: Floats | None) -> None: ...  # noqa: D102
+    def close(self) -> None: ...  # noqa: D102
+
+
+class Writers(NamedTuple):
+    """The classes that write the two kinds of files."""
+
+    sensors: Callable[..., SensorLog]
+    run: Callable[..., RunLog]
+
+
+def rerun_writers() -> Writers:
+    """The writers of Rerun recordings."""
+    from workbench.rrd import RunWriter, SensorWriter
+
+    return Writers(SensorWriter, RunWriter)
+
+
+# ------------------------------------------------------------------------------ interrupt
+
+
+class Interrupt:
+    """Turns the first Ctrl-C or SIGTERM into a request to stop; the second Ctrl-C raises KeyboardInterrupt.
+
+    A context manager; the handlers before it are put back at its end.
+    """
+
+    def __init__(self) -> None:
+        self.requested = False
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        if threading.current_thread() is not threading.main_thread():
+            return self
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._note)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _note(self, number: int, frame: FrameType | None) -> None:
+        if self.requested:
+            raise KeyboardInterrupt
+        self.requested = True
+
+
+# -------------------------------------------------------------------------------- session
+
+
+def open_any(path: Path, options: ReadOptions) -> Recording:
+    """Open a recording of any format that a reader knows.
+
+    Raises:
+        RecordingError: no reader can use it.
+    """
+    from readers import open_recording
+
+    return open_recording(path, options)
+
+
+def run(
+    request: Request,
+    *,
+    on_progress: Callable[[Progress], None] | None = None,
+    writers: Writers | None = None,
+) -> Outcome:
+    """Replay a recording and write its run folder.
+
+    Args:
+        request: what is asked for.
+        on_progress: called after every frame.
+        writers: the classes that write the files; those of `workbench.rrd` by default.
+
+    Raises:
+        WorkbenchError: the request cannot be met; nothing is written.
+        KeyboardInterrupt: a second interrupt came while the files were being finished.
+    """
+    estimator = plugin(request.estimator)
+    preset = request.preset or estimator.usual_preset
+    resolved = resolve(estimator, preset=preset, file=request.settings_file, overrides=request.overrides)
+    name = run_name(request.name or preset)
+    if request.stride < 1:
+        raise SettingsError(f"--stride {request.stride}: must be 1 or more")
+    with open_any(request.path, request.options) as recording:
+        session = _prepare(request, recording, estimator, resolved, name, preset)
+        with Interrupt() as interrupt:
+            return session.replay(writers or rerun_writers(), interrupt, on_progress)
+
+
+def run_name(name: str) -> str:
+    """A run's name, which is part of file names and entity paths.
+
+    Raises:
+        SettingsError: it has other characters than letters, digits, dot, dash and underscore, or is taken.
+    """
+    if not re.fullmatch(r"[A-Za-z0-9_][A-Za-z0-9_.-]{0,99}", name) or name == "sensors":
+        raise SettingsError(
+            f"{name!r} cannot be the name of a run: use letters, digits, dot, dash, underscore (not 'sensors')"
+        )
+    return name
+
+
+def run_folder(request: Request) -> Path:
+    """Where the results go: the folder asked for, else ``results/`` and the recording's name.
+
+    Raises:
+        RecordingError: it lies within the recording, which is never written to, or is a file.
+    """
+    source = request.path.resolve()
+    stem = source.name if source.is_dir() else source.stem
+    folder = request.out or Path("results") / (re.sub(r"[^\w.-]+", "_", stem) or "recording")
+    target = folder.resolve()
+    if target == source or source in target.parents:
+        raise RecordingError(folder, "the results would lie within the recording", "choose another folder with -o")
+    if target.exists() and not target.is_dir():
+        raise RecordingError(folder, "there is a file of that name", "choose another folder with -o")
+    return folder
+
+
+def _prepare(
+    request: Request, recording: Recording, estimator: Plugin, resolved: Resolved, name: str, preset: str
+) -> _Session:
+    """Make every choice that can fail before anything is written."""
+    image = inputs.choose_images(recording, request.image)
+    start_ns, stop_ns = _window(request, recording, image)
+    first = inputs.first_frame(recording, image, start_ns, stop_ns)
+    offset_ns = round(request.reference_offset_s * 1e9)
+    reference = inputs.load_reference(recording, request.reference, start_ns, stop_ns, offset_ns)
+    if request.calibrate_scale and not reference.poses:
+        raise StreamError(f"{request.path}: --calibrate-scale needs a reference, but there is {reference.sentence}")
+    height = inputs.choose_height(recording, request.height)
+    resolved, scale, notes = inputs.with_scale(resolved, recording, image, first.size_px, height)
+    resolved = inputs.with_start(resolved, reference, first.t_ns + offset_ns)
+    stream = getattr(resolved.settings, "height_stream", "")
+    if stream:
+        recording.stream(stream)
+    return _Session(
+        request=request,
+        recording=_Audited(recording),
+        estimator=estimator.build(resolved.settings),
+        name=name,
+        preset=preset,
+        folder=run_folder(request),
+        image=image,
+        others=(stream,) if stream and stream != image else (),
+        start_ns=start_ns,
+        stop_ns=stop_ns,
+        reference=reference,
+        offset_ns=offset_ns,
+        scale=scale,
+        notes=[*recording.notes, *notes],
+        digest=inputs.digest(request.path),
+    )
+
+
+def _window(request: Request, recording: Recording, image: str) -> tuple[int | None, int | None]:
+    """The window in nanoseconds; the beginning of the recording is read only if its time is needed."""
+    if request.start is None and request.stop is None:
+        return None, None
+    origin_ns = inputs.first_frame(recording, image, None, None).t_ns
+    start_ns, stop_ns = (
+        None if text is None else inputs.parse_time(text, origin_ns) for text in (request.start, request.stop)
+    )
+    if start_ns is not None and stop_ns is not None and stop_ns <= start_ns:
+        raise StreamError(f"--to {request.stop} does not lie after --from {request.start}")
+    return start_ns, stop_ns
+
+
+class _Audited(Recording):
+    """A recording whose image stream is audited while it is read."""
+
+    def __init__(self, inner: Recording) -> None:
+        self.path, self.format, self.notes = inner.path, inner.format, inner.notes
+        self._inner = inner
+        self.audits: dict[str, StreamAudit] = {}
+
+    @property
+    def streams(self) -> tuple[StreamInfo, ...]:
+        return self._inner.streams
+
+    def read(
+        self, streams: Sequence[str] | None = None, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[Sample]:
+        for sample in self._inner.read(streams, start_ns, stop_ns):
+            if sample.stream not in self.audits:
+                self.audits[sample.stream] = StreamAudit(sample.stream)
+            self.audits[sample.stream].add(sample)
+            yield sample
+
+    def count_before(self, stream: str, t_ns: int) -> int:
+        return self._inner.count_before(stream, t_ns)
+
+    def facts(self) -> list[str]:
+        """The oddities of what was read, one sentence each."""
+        return [f"{fact.stream}: {fact.sentence}" for audit in self.audits.values() for fact in audit.facts()]
+
+    def damage_lines(self) -> list[str]:
+        """What of the file was found damaged so far."""
+        return [str(damage) for damage in self._inner.damage]
+
+
+@dataclass(slots=True)
+class _Path:
+    """The trajectory of a run while it grows: 40 bytes a frame."""
+
+    frames: array[int] = field(default_factory=lambda: array("q"))
+    t_ns: array[int] = field(default_factory=lambda: array("q"))
+    poses: array[float] = field(default_factory=lambda: array("d"))
+
+    def add(self, step: Step, pose: Floats) -> None:
+        """Take the pose (x, y, heading) of one step."""
+        self.frames.append(step.frame)
+        self.t_ns.append(step.t_ns)
+        self.poses.extend(float(v) for v in pose)
+
+    def times(self) -> Any:
+        """Times in nanoseconds, int64 [n]."""
+        return np.array(self.t_ns, dtype=np.int64)
+
+    def pose(self) -> Floats:
+        """Poses, float64 [n, 3]."""
+        return np.array(self.poses, dtype=np.float64).reshape(-1, 3)
+
+
+@dataclass(frozen=True, kw_only=True)
+class _Session:
+    """One replay with every choice made."""
+
+    request: Request
+    recording: _Audited
+    estimator: Estimator[Any]
+    name: str
+    preset: str
+    folder: Path
+    image: str
+    others: tuple[str, ...]
+    start_ns: int | None
+    stop_ns: int | None
+    reference: inputs.Reference
+    offset_ns: int
+    scale: inputs.Scale
+    notes: list[str]
+    digest: str
+
+    # ---- the loop
+
+    def replay(self, writers: Writers, interrupt: Interrupt, on_progress: Callable[[Progress], None] | None) -> Outcome:
+        """Replay, judge and write."""
+        self.folder.mkdir(parents=True, exist_ok=True)
+        self._write_toml({"complete": False})
+        tally, path, stopped = Tally(), _Path(), ""
+        with contextlib.ExitStack() as files:
+            sensors = self._sensors(writers, files)
+            run = files.enter_context(contextlib.closing(self._run_writer(writers)))
+            tum = files.enter_context(self._file("tum").open("w", encoding="ascii"))
+            steps = files.enter_context(contextlib.closing(self._steps(on_progress)))
+            try:
+                for replayed in steps:
+                    self._take(replayed, sensors, run, tum, tally, path)
+                    if interrupt.requested:
+                        break
+            except RecordingError as error:
+                if not tally.frames:
+                    raise
+                stopped = str(error)
+            summary = self._finish(sensors, run, tally, path, interrupt.requested, stopped)
+        if sensors is not None and not summary["interrupted"] and not stopped:
+            _replace(self.folder / "sensors.toml", to_toml(self._sensors_values()))
+        self._write_toml({"complete": True, "summary": summary})
+        return Outcome(self.folder, self._file("rrd"), self.folder / "sensors.rrd", summary)
+
+    def _steps(self, on_progress: Callable[[Progress], None] | None) -> Generator[Replayed]:
+        total = self._expected()
+
+        def tell(done: int, t_ns: int) -> None:
+            if on_progress is not None:
+                on_progress(Progress(done, total, t_ns))
+
+        return replay(
+            self.recording,
+            self.estimator,
+            image_stream=self.image,
+            other_streams=self.others,
+            start_ns=self.start_ns,
+            stop_ns=self.stop_ns,
+            stride=self.request.stride,
+            on_progress=tell,
+        )
+
+    def _take(
+        self, replayed: Replayed, sensors: SensorLog | None, run: RunLog, tum: TextIO, tally: Tally, path: _Path
+    ) -> None:
+        step, sample = replayed.step, replayed.sample
+        if sensors is not None:
+            _log_sample(sensors, step, sample)
+        run.step(step)
+        if isinstance(sample, Problem):
+            run.event(step.frame, step.t_ns, Severity.ERROR, sample.reason)
+        tally.add(step.verdict, step.alarms, bool(getattr(step, "accepted", True)))
+        pose = getattr(step, "pose", None)
+        if pose is not None:
+            path.add(step, pose)
+            tum.write(tum_line(step.t_ns, pose))
+
+    def _expected(self) -> int | None:
+        """How many frames there will be, as far as the recording says it."""
+        info = self.recording.stream(self.image)
+        if info.count < 0:
+            return None
+        share = 1.0
+        if (self.start_ns is not None or self.stop_ns is not None) and info.last_ns > info.first_ns:
+            first = max(info.first_ns, self.start_ns if self.start_ns is not None else info.first_ns)
+            last = min(info.last_ns, self.stop_ns if self.stop_ns is not None else info.last_ns)
+            share = min(1.0, max(0.0, (last - first) / (info.last_ns - info.first_ns)))
+        return math.ceil(share * info.count / self.request.stride)
+
+    # ---- the end
+
+    def _finish(
+        self, sensors: SensorLog | None, run: RunLog, tally: Tally, path: _Path, interrupted: bool, stopped: str
+    ) -> dict[str, Any]:
+        """Judge the run, log what is known at its end, and return the summary."""
+        estimate = Trajectory.of(path.times(), path.pose())
+        evaluation, refused = self._evaluate(estimate)
+        facts, damage = self.recording.facts(), self.recording.damage_lines()
+        summary = self._summary(tally, path, evaluation, refused, interrupted, stopped)
+        summary |= {"facts": facts, "damage": damage}
+        aligned = None
+        if evaluation is not None:
+            aligned = evaluation.alignment(estimate.pose)[:, :2]
+            frames = _frames_of(path, estimate)[evaluation.index]
+            run.errors(frames=frames, t_ns=estimate.t_ns[evaluation.index], values=evaluation.errors)
+        if len(path.frames):
+            frame, t_ns = path.frames[-1], path.t_ns[-1]
+            for text in damage:
+                run.event(frame, t_ns, Severity.WARNING, f"damage: {text}")
+            if stopped:
+                run.event(frame, t_ns, Severity.ERROR, stopped)
+        if sensors is not None:
+            sensors.facts([*self.notes, *(f"damage: {text}" for text in damage), *facts])
+        run.finish(_flat(lines(summary)), aligned)
+        return summary
+
+    def _evaluate(self, estimate: Trajectory) -> tuple[Evaluation | None, str]:
+        """The evaluation, or why there is none."""
+        if not self.reference.poses:
+            return None, self.reference.sentence
+        try:
+            result = evaluate(estimate, self.reference.path, with_scale=not self.scale.known, offset_ns=self.offset_ns)
+        except EvaluationError as error:
+            return None, f"{self.reference.sentence}; not compared: {error}"
+        return result, self.reference.sentence
+
+    def _summary(
+        self,
+        tally: Tally,
+        path: _Path,
+        evaluation: Evaluation | None,
+        reference: str,
+        interrupted: bool,
+        stopped: str,
+    ) -> dict[str, Any]:
+        times = path.times()
+        gaps = np.diff(times) / 1e9
+        median_dt_s = float(np.median(gaps)) if len(gaps) else math.nan
+        return {
+            "recording": str(self.request.path),
+            "format": self.recording.format,
+            "estimator": self.estimator.name,
+            "preset": self.preset,
+            "run": self.name,
+            "image_stream": self.image,
+            "frames": tally.frames,
+            "duration_s": float(times[-1] - times[0]) / 1e9 if len(times) else 0.0,
+            "median_dt_s": median_dt_s,
+            "verdicts": tally.named(),
+            "alarms": tally.named_alarms(),
+            "path_length": float(path_lengths(path.pose()[:, :2])[-1]) if len(times) else 0.0,
+            "unit": self.scale.unit,
+            "scale": self.scale.sentence,
+            "reference": reference,
+            "evaluation": None if evaluation is None else evaluation_values(evaluation),
+            "calibration": self._calibration(evaluation),
+            "suitability": suitability(tally, median_dt_s),
+            "notes": self.notes,
+            "interrupted": interrupted,
+            "stopped_early": stopped,
+        }
+
+    def _calibration(self, evaluation: Evaluation | None) -> dict[str, Any] | None:
+        """The price of a pixel (or the focal length) that brings the path over the reference."""
+        if not self.request.calibrate_scale:
+            return None
+        if evaluation is None:
+            raise EvaluationError(
+                f"{self.request.path}: --calibrate-scale: the run cannot be compared with a reference"
+            )
+        return calibration(self.estimator.settings, evaluation)
+
+    # ---- files
+
+    def _file(self, suffix: str) -> Path:
+        return self.folder / f"{self.name}.{suffix}"
+
+    def _sensors(self, writers: Writers, files: contextlib.ExitStack) -> SensorLog | None:
+        """The writer of the mission's measurements, None where they stand there already."""
+        record, file = self.folder / "sensors.toml", self.folder / "sensors.rrd"
+        wanted = to_toml(self._sensors_values())
+        if file.is_file() and record.is_file() and tomllib.loads(record.read_text("utf-8")) == tomllib.loads(wanted):
+            return None
+        record.unlink(missing_ok=True)
+        writer = writers.sensors(file, recording_id=self.recording_id, raw_images=self.request.raw_images)
+        files.enter_context(contextlib.closing(writer))
+        writer.reference(self.reference.poses)
+        return writer
+
+    def _run_writer(self, writers: Writers) -> RunLog:
+        return writers.run(
+            self._file("rrd"),
+            recording_id=self.recording_id,
+            run=self.name,
+            estimator=self.estimator.name,
+            step_type=self.estimator.step_type,
+            settings_text=to_toml(settings_values(self.estimator.settings)),
+        )
+
+    @property
+    def recording_id(self) -> str:
+        """The mission's id: equal for equal input, so that several runs of it lie over one another."""
+        return self.digest[:32]
+
+    def _window_values(self) -> dict[str, Any]:
+        return {"start_ns": self.start_ns, "stop_ns": self.stop_ns, "stride": self.request.stride}
+
+    def _sensors_values(self) -> dict[str, Any]:
+        return {
+            "format": FORMAT,
+            "digest": self.digest,
+            "image_stream": self.image,
+            "reference_stream": self.reference.stream,
+            "raw_images": self.request.raw_images,
+            "window": self._window_values(),
+            "versions": {"estimator-workbench": _version("estimator-workbench"), "rerun-sdk": _version("rerun-sdk")},
+        }
+
+    def _write_toml(self, state: dict[str, Any]) -> None:
+        values = {
+            "format": FORMAT,
+            "complete": state["complete"],
+            "interrupted": bool(state.get("summary", {}).get("interrupted", False)),
+            "run": {
+                "name": self.name,
+                "estimator": self.estimator.name,
+                "preset": self.preset,
+                "recording": str(self.request.path),
+                "digest": self.digest,
+                "image_stream": self.image,
+                "reference_stream": self.reference.stream,
+                "reference_offset_s": self.request.reference_offset_s,
+            },
+            "window": self._window_values(),
+            "settings": settings_values(self.estimator.settings),
+            "versions": versions(),
+            "summary": state.get("summary", {}),
+        }
+        _replace(self._file("toml"), to_toml(values))
+
+
+# -------------------------------------------------------------------------------- helpers
+
+
+def calibration(settings: Any, evaluation: Evaluation) -> dict[str, Any]:
+    """What the scale settings would have to be, by least squares over the positions and by path length.
+
+    Where no scale can be told, `key` is empty and `sentence` says why.
+    """
+    key = "metres_per_px" if getattr(settings, "metres_per_px", None) is not None else "focal_px"
+    used = getattr(settings, key, None)
+    if used is None:
+        return {"key": "", "sentence": "not possible: this estimator has no scale to calibrate"}
+    if not evaluation.alignment.determined or not evaluation.path_m > 0:
+        return {"key": "", "sentence": "not possible: the path or its reference does not move"}
+    by_length = evaluation.alignment.scale * evaluation.reference_path_m / evaluation.path_m
+    factors = evaluation.fitted_scale, by_length
+    fit, ratio = (used * f if key == "metres_per_px" else used / f for f in factors)
+    sentence = f"{key} = {fit:.6g} by least squares, {ratio:.6g} by path length; use --set {key}={fit:.6g}"
+    if abs(ratio / fit - 1) > CALIBRATION_AGREES:
+        sentence += ", with care: the two do not agree, so that the path's shape is wrong, not only its scale"
+    return {"key": key, "least_squares": fit, "path_ratio": ratio, "sentence": sentence}
+
+
+def tum_line(t_ns: int, pose: Floats) -> str:
+    """One line of a TUM trajectory: time (s), x, y, z (m), quaternion x, y, z, w of a pose in the plane."""
+    x, y, heading = (float(v) for v in pose)
+    seconds, rest = divmod(t_ns, inputs.SECOND_NS)
+    return f"{seconds}.{rest:09d} {x:.9f} {y:.9f} 0 0 0 {math.sin(heading / 2):.9f} {math.cos(heading / 2):.9f}\n"
+
+
+def versions() -> dict[str, str]:
+    """Versions of Python, of the workbench and of the packages that results depend on."""
+    return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
+
+
+def _version(package: str) -> str:
+    try:
+        return importlib.metadata.version(package)
+    except importlib.metadata.PackageNotFoundError:
+        return "not installed"
+
+
+def _log_sample(sensors: SensorLog, step: Step, sample: ImageSample | Problem) -> None:
+    if isinstance(sample, Problem):
+        sensors.undecodable(step.frame, step.t_ns, sample.reason)
+        return
+    try:
+        sensors.image(step.frame, sample)
+    except ImageError as error:
+        sensors.undecodable(step.frame, step.t_ns, str(error))
+
+
+def _frames_of(path: _Path, estimate: Trajectory) -> Any:
+    """The frame numbers [n] of a trajectory's poses, which are in the order of time."""
+    times, first = np.unique(path.times(), return_index=True)
+    frames = np.array(path.frames, dtype=np.int64)[first]
+    return frames[np.searchsorted(times, estimate.t_ns)]
+
+
+def _flat(rows: Sequence[tuple[str, str]]) -> dict[str, str]:
+    """Rows of names and texts as a mapping; texts of the same name are joined."""
+    joined: dict[str, str] = {}
+    for name, text in rows:
+        joined[name] = f"{joined[name]}; {text}" if name in joined else text
+    return joined
+
+
+def _replace(file: Path, text: str) -> None:
+    """Write a file so that it is there as a whole or not at all."""
+    part = file.with_name(file.name + ".part")
+    part.write_text(text, encoding="utf-8")
+    part.replace(file)

@@ -1,0 +1,231 @@
+"""What is said at the end of a run: counts, shares, and plain sentences on whether method and data suit each other."""
+
+from __future__ import annotations
+
+import math
+from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from typing import Any
+
+from pipelines.evaluation import Evaluation, Relative, Statistics
+from pipelines.verdict import Severity, Verdict, flags
+
+NOTABLE_SHARE = 0.05
+TRUSTED_SHARE = 0.5
+MOST_CAUSES = 6
+SLOW_FRAMES_S = 0.5
+
+ADVICE: Mapping[Verdict, str] = {
+    Verdict.DUPLICATE_FRAME: "the log repeats frames; they carry no motion",
+    Verdict.FRAME_GAP: "frames are missing in the log, or its stamps are irregular",
+    Verdict.HEIGHT_CHANGE: "the camera's height is not constant: without a height stream the scale is wrong",
+    Verdict.EXPOSURE_JUMP: "the brightness changes from frame to frame: fix the exposure, or set gain_and_offset",
+    Verdict.BLURRED: "motion blur: a shorter exposure is needed",
+    Verdict.PEAK_AMBIGUOUS: "the surface repeats itself: a match one period away looks as good as the right one",
+    Verdict.PEAK_AT_BORDER: "the motion between frames is longer than the search: raise search_radius_px",
+    Verdict.LOW_CORRELATION: "the frames do not look like their templates: no flat ground below the camera, "
+    "too little overlap, or turning too fast",
+    Verdict.LOW_TEXTURE: "the surface has too little texture: raise fragment_side_px",
+    Verdict.APERTURE: "the texture is striped and does not tell the shift along its stripes",
+    Verdict.RESIDUAL_HIGH: "the matches leave much unexplained: relief, shadows, blur or compression",
+    Verdict.ROTATION_BEYOND_LIMIT: "it turns faster between frames than fragments of this size allow (1)",
+    Verdict.SUBPIXEL_DIVERGED: "the subpixel refinement does not settle: false peaks or too little texture",
+    Verdict.SEARCH_OUTSIDE_IMAGE: "the search areas leave the image: the motion is long or the image is small",
+    Verdict.NOT_RIGID: "the fragments do not move as one plane: relief, moving things or false peaks",
+    Verdict.TOO_FEW_INLIERS: "too few fragments agree: false peaks, relief or no flat ground below the camera",
+    Verdict.OUT_OF_ORDER: "stamps go backwards; those frames were skipped",
+    Verdict.SIZE_CHANGED: "the image size changes within the stream",
+    Verdict.UNDECODABLE: "images are damaged",
+    Verdict.LOST: "the search does not lock; the path there is the last velocity held on, not a measurement",
+}
+
+
+@dataclass(slots=True)
+class Tally:
+    """Counts the steps of a run while they pass by."""
+
+    frames: int = 0
+    used: int = 0
+    verdicts: Counter[Verdict] = field(default_factory=Counter)
+    alarms: Counter[Verdict] = field(default_factory=Counter)
+
+    def add(self, verdict: Verdict, alarms: Verdict, accepted: bool) -> None:
+        """Take note of one step."""
+        self.frames += 1
+        self.used += accepted
+        self.verdicts[verdict] += 1
+        for flag in flags(alarms):
+            self.alarms[flag] += 1
+
+    def named(self) -> dict[str, int]:
+        """Frames by verdict, most frequent first."""
+        return {name_of(v): n for v, n in self.verdicts.most_common()}
+
+    def named_alarms(self) -> dict[str, int]:
+        """Frames by alarm, most frequent first; a frame can have several."""
+        return {name_of(v): n for v, n in self.alarms.most_common()}
+
+
+def name_of(verdict: Verdict) -> str:
+    """The name of one verdict."""
+    return verdict.name or "OK"
+
+
+def suitability(tally: Tally, median_dt_s: float) -> list[str]:
+    """Plain sentences on how far the method suits the recording: the upshot first, then the gravest causes."""
+    if tally.frames < 2:
+        return ["fewer than two frames: there is no motion to estimate"]
+    causes = []
+    if median_dt_s > SLOW_FRAMES_S:
+        causes.append(
+            f"median time between frames {median_dt_s:.3g} s: the method expects frames that overlap by far, "
+            "as at video rate; between distant frames its motion prediction has nothing to go by"
+        )
+    for verdict in sorted(ADVICE, key=lambda v: (v.severity, tally.alarms[v]), reverse=True):
+        share = tally.alarms[verdict] / tally.frames
+        if share >= NOTABLE_SHARE:
+            causes.append(f"{percent(share)} of the frames {name_of(verdict)}: {ADVICE[verdict]}")
+    return [_upshot(tally.used / (tally.frames - 1), bool(causes)), *causes[:MOST_CAUSES]]
+
+
+def _upshot(used: float, doubts: bool) -> str:
+    """How much of the path was measured, in one sentence."""
+    measured = f"{percent(min(used, 1.0))} of the motions were measured"
+    if used < TRUSTED_SHARE:
+        return f"do not trust this path: only {measured}, the others hold the last velocity"
+    if used < 1 - NOTABLE_SHARE:
+        return f"only {measured}, the others hold the last velocity"
+    return f"{measured}, but look at what follows" if doubts else f"{measured}; nothing speaks against the method here"
+
+
+def percent(share: float) -> str:
+    """A share as a percentage for a sentence, never rounded to all or nothing."""
+    value = 100 * share
+    if 0 < value < 1 or 99 < value < 100:
+        return f"{math.floor(value * 10) / 10 if value > 99 else math.ceil(value * 10) / 10:.1f} %"
+    return f"{value:.0f} %"
+
+
+def evaluation_values(result: Evaluation) -> dict[str, Any]:
+    """An evaluation as plain values, lengths in metres, angles in degrees."""
+    return {
+        "matched": result.matched,
+        "total": result.total,
+        "offset_s": result.offset_ns / 1e9,
+        "reference_path_m": result.reference_path_m,
+        "path_m": result.path_m,
+        "alignment": {
+            "rotation_deg": math.degrees(result.alignment.rotation_rad),
+            "translation_m": [float(v) for v in result.alignment.translation_m],
+            "scale": result.alignment.scale,
+            "determined": result.alignment.determined,
+        },
+        "ape_m": statistics_values(result.ape_m),
+        "ape_heading_deg": statistics_values(result.ape_heading_rad, math.degrees(1)),
+        "rpe": [relative_values(relative) for relative in result.rpe],
+        "end_error_m": result.end_error_m,
+        "drift_percent": 100 * result.drift,
+        "yaw_drift_deg": math.degrees(result.yaw_drift_rad),
+        "yaw_drift_deg_per_m": math.degrees(result.yaw_drift_rad_per_m),
+        "notes": list(result.notes),
+    }
+
+
+def statistics_values(statistics: Statistics, factor: float = 1.0) -> dict[str, float | int]:
+    """Statistics as plain values, times a factor for another unit."""
+    return {
+        "rmse": factor * statistics.rmse,
+        "mean": factor * statistics.mean,
+        "median": factor * statistics.median,
+        "max": factor * statistics.max,
+        "count": statistics.count,
+    }
+
+
+def relative_values(relative: Relative) -> dict[str, Any]:
+    """A relative error as plain values."""
+    return {
+        "delta": relative.delta,
+        "unit": relative.unit,
+        "compared": relative.compared,
+        "translation_m": statistics_values(relative.translation_m),
+        "heading_deg": statistics_values(relative.heading_rad, math.degrees(1)),
+    }
+
+
+def without_nan(value: Any) -> Any:
+    """The same values with None for every number that is not finite, as JSON needs it."""
+    if isinstance(value, Mapping):
+        return {key: without_nan(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [without_nan(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The summary of a run as rows of a name and a text, for the terminal and the log."""
+    rows = [
+        ("recording", f"{summary['recording']} ({summary['format']})"),
+        ("estimator", f"{summary['estimator']}, preset {summary['preset']}, run {summary['run']}"),
+        ("frames", _frames(summary)),
+        ("verdicts", _counts(summary["verdicts"])),
+        ("path length", f"{summary['path_length']:.4g} {summary['unit']}"),
+        ("scale", summary["scale"]),
+    ]
+    if summary["alarms"] != {name: n for name, n in summary["verdicts"].items() if name != "OK"}:
+        rows.insert(4, ("alarms", _counts(summary["alarms"])))
+    rows += _evaluation_lines(summary)
+    if summary.get("calibration"):
+        rows.append(("calibration", summary["calibration"]["sentence"]))
+    for key, title in (("suitability", "suitability"), ("notes", "note"), ("damage", "damage"), ("facts", "fact")):
+        rows += [(title, text) for text in summary[key]]
+    if summary["interrupted"]:
+        rows.append(("interrupted", "the replay was stopped; everything up to there is in the files"))
+    if summary["stopped_early"]:
+        rows.append(("stopped early", summary["stopped_early"]))
+    return rows
+
+
+def _frames(summary: Mapping[str, Any]) -> str:
+    return f"{summary['frames']} in {summary['duration_s']:.3f} s of {summary['image_stream']}"
+
+
+def _counts(counts: Mapping[str, int]) -> str:
+    return ", ".join(f"{name} {n}" for name, n in counts.items()) or "none"
+
+
+def _evaluation_lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    result = summary["evaluation"]
+    if result is None:
+        return [("reference", summary["reference"])]
+    rows = [
+        ("reference", f"{summary['reference']}; {result['matched']} of {result['total']} poses associate"),
+        ("APE", _statistics(result["ape_m"], "m", f"after {_alignment(result['alignment'])}")),
+    ]
+    if result["ape_heading_deg"]["count"]:
+        rows.append(("APE heading", _statistics(result["ape_heading_deg"], "°", "")))
+    for relative in result["rpe"]:
+        if relative["translation_m"]["count"]:
+            over = f"over {relative['delta']:g} {relative['unit']} ({relative['compared']})"
+            rows.append(("RPE", _statistics(relative["translation_m"], "m", over)))
+    drift = "no value" if math.isnan(result["drift_percent"]) else f"{result['drift_percent']:.3g} % of the path"
+    rows.append(("drift", f"{drift}: {result['end_error_m']:.4g} m at the end of {result['reference_path_m']:.4g} m"))
+    if not math.isnan(result["yaw_drift_deg"]):
+        rows.append(("yaw drift", f"{result['yaw_drift_deg']:.3g}°, {result['yaw_drift_deg_per_m']:.3g}°/m"))
+    return rows + [("reference", note) for note in result["notes"]]
+
+
+def _statistics(values: Mapping[str, float], unit: str, what: str) -> str:
+    numbers = ", ".join(f"{name} {values[name]:.4g} {unit}" for name in ("rmse", "mean", "median", "max"))
+    return f"{numbers} {what}".strip()
+
+
+def _alignment(alignment: Mapping[str, Any]) -> str:
+    scale = f" and scale {alignment['scale']:.4g}" if alignment["scale"] != 1.0 else ""
+    return f"alignment in the plane (rotation {alignment['rotation_deg']:.2f}°{scale})"
+
+
+def grave(verdict: Verdict) -> bool:
+    """Whether a verdict is a warning or worse."""
+    return verdict.severity >= Severity.WARNING
