@@ -29,9 +29,9 @@ from typing import NamedTuple
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+
 from pipelines.correlation.odometry import CorrelationOdometry
 from pipelines.correlation.settings import CorrelationSettings
-
 from pipelines.simulation.mission import IMAGE, SimulatedMission
 from pipelines.simulation.surfaces import Surface, gravel, surface_from_image
 from pipelines.simulation.trajectories import drive, figure_eight, image_motion

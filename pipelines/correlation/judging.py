@@ -37,6 +37,7 @@ class Limits(NamedTuple):
     search_radius_px: float
     min_eigenvalue: float
     min_texture_ratio: float
+    slope_noise: float
     max_condition: float
     step_limit_px: float
     rotation_limit_rad: float
@@ -53,6 +54,7 @@ def limits_of(s: CorrelationSettings) -> Limits:
         float(s.search_radius_px),
         s.min_eigenvalue,
         s.min_texture_ratio,
+        0.5 if s.refiner == "one-step" else 1.3923,  # central differences, slopes of the cubic spline
         s.max_condition,
         s.step_limit_px,
         rotation_limit(s.fragment_side_px),
@@ -92,8 +94,8 @@ def alarms_of_match(surface, hessian, block, centres, search, limits):  # type: 
         away[i] = max(
             abs(centres[i, 0] + m.peak_px[i, 0] - search[i, 0]), abs(centres[i, 1] + m.peak_px[i, 1] - search[i, 1])
         )
-        # noise of σ grey levels alone gives central differences a power of σ²/2, and a residual of √2 σ
-        noise = m.residual_rms[i] ** 2 / 4.0
+        # noise of σ grey levels alone leaves a residual of √2 σ and gives the slopes a power of slope_noise · σ²
+        noise = limits.slope_noise * m.residual_rms[i] ** 2 / 2.0
         missing[i] = max(limits.min_eigenvalue, limits.min_texture_ratio * noise) - m.smallest_eigenvalue[i]
         diverged += not m.delta_length_px[i] <= limits.step_limit_px
     if _high(away, every) >= limits.search_radius_px:

@@ -19,8 +19,8 @@ Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Grey = NDArray[np.uint8]
 
-TAPS = 12
-"""Taps of the cardinal cubic spline; what is cut off weighs less than 4e-4."""
+TAPS = 18
+"""Taps of the cardinal quintic spline; what is cut off weighs less than 5e-4."""
 POLE = 3.0**0.5 - 2.0
 """Pole of the cubic B-spline's prefilter."""
 PREFILTER_MARGIN = 8
@@ -34,7 +34,9 @@ QUANTISATION = 0.3
 HILL_PX = 2
 """Positions this close to the first peak belong to its hill and are no second peak."""
 
-_CARDINAL = (-6.0 * POLE / (1.0 - POLE * POLE)) * POLE ** np.abs(np.arange(-TAPS, TAPS + 1))
+_BASIS_5 = np.array([66.0, 26.0, 1.0] + [0.0] * 251 + [1.0, 26.0]) / 120.0
+_CARDINAL = np.roll(np.fft.ifft(1.0 / np.fft.fft(_BASIS_5)).real, TAPS)[: 2 * TAPS + 1]
+"""Impulse response of the quintic B-spline's prefilter, from -TAPS to TAPS."""
 
 
 class Matches(NamedTuple):
@@ -265,21 +267,25 @@ def templates(coefficients, side, rotation_rad):  # type: ignore[no-untyped-def]
 
 
 @_jit
+def _basis_5(t):  # type: ignore[no-untyped-def]
+    """The quintic B-spline."""
+    t = abs(t)
+    if t < 1.0:
+        return 11.0 / 20.0 - t**2 / 2.0 + t**4 / 4.0 - t**5 / 12.0
+    if t < 2.0:
+        return 17.0 / 40.0 + 5.0 * t / 8.0 - 7.0 * t**2 / 4.0 + 5.0 * t**3 / 4.0 - 3.0 * t**4 / 8.0 + t**5 / 24.0
+    return (3.0 - t) ** 5 / 120.0 if t < 3.0 else 0.0
+
+
+@_jit
 def _cardinal_weights(fraction, weights):  # type: ignore[no-untyped-def]
-    """Weights of the TAPS pixels around a position `fraction` after the sixth of them (cubic spline)."""
-    f = fraction
-    b = (
-        (1.0 - f) ** 3 / 6.0,
-        (3.0 * f**3 - 6.0 * f**2 + 4.0) / 6.0,
-        (-3.0 * f**3 + 3.0 * f**2 + 3.0 * f + 1.0) / 6.0,
-        f**3 / 6.0,
-    )
+    """Weights of the TAPS pixels around a position, `fraction` after the (TAPS/2)th of them (quintic spline)."""
     total = 0.0
     first = 1 - TAPS // 2
     for k in range(TAPS):
         w = 0.0
-        for m in range(4):
-            w += b[m] * _CARDINAL[TAPS + (k + first) - (m - 1)]
+        for m in range(-2, 4):
+            w += _basis_5(fraction - m) * _CARDINAL[TAPS + k + first - m]
         weights[k] = w
         total += w
     for k in range(TAPS):

@@ -191,7 +191,7 @@ class CorrelationOdometry:
         history = self._history(state, *((residual, gradient) if accepted else (math.nan, math.nan)), dt_s)
         new_state = CorrelationState(
             frames=state.frames + 1,
-            template=candidate.template if accepted else state.template,
+            template=candidate.template if accepted else self._bridge(state),
             previous=Template(frame, grey, pose, covariance),
             previous_ns=sample.t_ns,
             relative=relative,
@@ -250,14 +250,19 @@ class CorrelationOdometry:
         s = self._settings
         if state.previous is not None and template.frame == state.previous.frame:
             return True
+        if state.lost_frames > 0:
+            return state.lost_frames <= s.bridge_frames and self._matcher.reaches(template, predicted)
         return (
             s.key_frames
-            and state.lost_frames <= s.bridge_frames
-            and (state.lost_frames > 0 or state.inliers >= s.key_min_inliers)
+            and state.inliers >= s.key_min_inliers
             and math.hypot(predicted.u, predicted.v) <= s.key_max_shift_px
             and abs(predicted.rotation_rad) <= s.key_max_rotation_rad
             and self._matcher.reaches(template, predicted)
         )
+
+    def _bridge(self, state: CorrelationState) -> Template | None:
+        """The template while lost: the last frame whose position was measured, which overlaps the most."""
+        return state.previous if state.lost_frames == 0 else state.template
 
     def _held(self, state: CorrelationState, dt_s: float) -> Motion:
         """The motion since the last frame at the last measured velocity; still where there is none."""
@@ -271,7 +276,8 @@ class CorrelationOdometry:
             held = self._held(state, dt_s) if self._settings.recovery else STILL
             # nothing was measured: the held motion may be wrong by its whole size
             sigma = max(math.hypot(held.u, held.v), 1.0), max(abs(held.rotation_rad), 0.01)
-            return held, state.relative.then(held), np.diag([sigma[0] ** 2, sigma[0] ** 2, sigma[1] ** 2])
+            relative = held if state.lost_frames == 0 else state.relative.then(held)
+            return held, relative, np.diag([sigma[0] ** 2, sigma[0] ** 2, sigma[1] ** 2])
         measured = candidate.motion
         assert state.previous is not None
         if candidate.template.frame == state.previous.frame:
@@ -492,10 +498,11 @@ class CorrelationOdometry:
 
 
 def eight_bit(grey: NDArray[np.uint8] | NDArray[np.uint16]) -> Grey:
-    """Grey levels as uint8; of 16-bit images the upper eight bits."""
-    if grey.dtype == np.uint8:
-        return grey  # type: ignore[return-value]
-    return (grey >> 8).astype(np.uint8)
+    """Grey levels as a read-only contiguous uint8 array; of 16-bit images the upper eight bits."""
+    eight = grey if grey.dtype == np.uint8 else grey >> 8
+    fixed = np.ascontiguousarray(eight, np.uint8).view()
+    fixed.setflags(write=False)  # compiled code is built for one kind of array
+    return fixed
 
 
 def _frame_of(state: CorrelationState, sample: ImageSample) -> int:

@@ -75,8 +75,8 @@ class CorrelationSettings(BaseModel):
     robust_scale_px: Positive = Field(0.3, description="residual at which a fragment loses half its weight")
     inlier_px: Positive = Field(1.0, description="largest residual of a fragment that agrees")
     min_inliers: Annotated[int, Field(ge=2)] = Field(3, description="fewer reject the frame")
-    tile_columns: Annotated[int, Field(ge=0, le=32)] = Field(7, description="photometric tiles along u, 0: none")
-    tile_rows: Annotated[int, Field(ge=0, le=32)] = Field(6, description="photometric tiles along v, 0: none")
+    tile_columns: Annotated[int, Field(ge=0, le=32)] = Field(9, description="photometric tiles along u, 0: none")
+    tile_rows: Annotated[int, Field(ge=0, le=32)] = Field(8, description="photometric tiles along v, 0: none")
     tile_side_px: Annotated[int, Field(ge=5, le=63)] = Field(21, description="side of a tile, odd")
     tile_rounds: Annotated[int, Field(ge=1, le=10)] = Field(3, description="most rounds of the photometric step")
     tile_tolerance_px: Positive = Field(0.03, description="a round that moves the frame less is the last one")
@@ -117,7 +117,7 @@ class CorrelationSettings(BaseModel):
     max_peak_ratio: Positive = Field(0.95, description="PEAK_AMBIGUOUS above (second peak over first)")
     min_eigenvalue: Annotated[float, Field(ge=0)] = Field(0.25, description="LOW_TEXTURE below, grey²/px² per pixel")
     min_texture_ratio: Annotated[float, Field(ge=0)] = Field(
-        3.0, description="LOW_TEXTURE where the eigenvalue is below this multiple of the noise's own"
+        2.2, description="LOW_TEXTURE where the eigenvalue is below this multiple of the noise's own"
     )
     max_condition: Positive = Field(9.0, description="APERTURE above (condition number of I_xyᵀ I_xy)")
     max_rigidity_px: Positive = Field(1.0, description="NOT_RIGID above, for two fragments")
@@ -174,6 +174,7 @@ class CorrelationSettings(BaseModel):
                 gain_and_offset=False,
                 max_iterations=1,
                 step_limit_px=1.0,
+                min_texture_ratio=3.0,
                 motion="paper",
                 min_inliers=2,
                 tile_columns=0,
