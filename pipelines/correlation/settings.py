@@ -117,7 +117,7 @@ class CorrelationSettings(BaseModel):
     max_peak_ratio: Positive = Field(0.95, description="PEAK_AMBIGUOUS above (second peak over first)")
     min_eigenvalue: Annotated[float, Field(ge=0)] = Field(0.25, description="LOW_TEXTURE below, grey²/px² per pixel")
     min_texture_ratio: Annotated[float, Field(ge=0)] = Field(
-        2.2, description="LOW_TEXTURE where the eigenvalue is below this multiple of the noise's own"
+        1.0, description="LOW_TEXTURE where the eigenvalue is below this multiple of the noise's own"
     )
     max_condition: Positive = Field(9.0, description="APERTURE above (condition number of I_xyᵀ I_xy)")
     max_rigidity_px: Positive = Field(1.0, description="NOT_RIGID above, for two fragments")
