@@ -63,7 +63,7 @@ class CorrelationState:
 
     `template` is the frame that is searched next and `relative` the motion from it to the last frame;
     `previous` is the last frame. `velocity` is the last measured motion between frames, which took
-    `velocity_s`. `usual` are the running medians over `history` [3, K]: residuals, gradients, intervals.
+    `velocity_s`. `usual` are the running medians over `history` [3, K]: residuals, sharpness, intervals.
     """
 
     frames: int = 0
@@ -184,11 +184,13 @@ class CorrelationOdometry:
 
         residual = median(candidate.matches.residual_rms)
         mean_grey, gradient = kernels.frame_statistics(grey)
-        alarms |= alarms_over_time(s, residual, gradient, dt_s, mean_grey - state.mean_grey, state.usual)
+        # over the squared mean, a longer exposure does not pass for a sharper image
+        sharpness = gradient / max(mean_grey, 1.0) ** 2
+        alarms |= alarms_over_time(s, residual, sharpness, dt_s, mean_grey - state.mean_grey, state.usual)
         accepted = candidate.acceptable
         if not accepted:
             alarms |= Verdict.LOST
-        history = self._history(state, *((residual, gradient) if accepted else (math.nan, math.nan)), dt_s)
+        history = self._history(state, *((residual, sharpness) if accepted else (math.nan, math.nan)), dt_s)
         new_state = CorrelationState(
             frames=state.frames + 1,
             template=candidate.template if accepted else self._bridge(state),

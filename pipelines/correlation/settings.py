@@ -124,7 +124,7 @@ class CorrelationSettings(BaseModel):
     max_scale_change: Positive = Field(0.01, description="HEIGHT_CHANGE above, of |scale - 1|")
     max_residual_ratio: Positive = Field(3.0, description="RESIDUAL_HIGH above this multiple of the running median")
     max_level_change: Positive = Field(8.0, description="EXPOSURE_JUMP above, change of the mean grey level")
-    min_gradient_ratio: Fraction = Field(0.5, description="BLURRED below this share of the running median")
+    min_sharpness_ratio: Fraction = Field(0.5, description="BLURRED below this share of the running median")
     gap_factor: Positive = Field(1.6, description="FRAME_GAP above this multiple of the running median of dt")
     median_frames: Annotated[int, Field(ge=3, le=255)] = Field(31, description="frames of the running medians")
 
