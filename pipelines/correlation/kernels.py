@@ -19,12 +19,12 @@ Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Grey = NDArray[np.uint8]
 
-TAPS = 18
-"""Taps of the cardinal quintic spline; what is cut off weighs less than 5e-4."""
+TAPS = 12
+"""Taps of the cardinal quintic spline, renormalised to 1; with more of them the S-curve is no smaller."""
 POLE = 3.0**0.5 - 2.0
 """Pole of the cubic B-spline's prefilter."""
-PREFILTER_MARGIN = 8
-"""Pixels around a patch after which the prefilter has forgotten the border (POLE^8 = 3e-5)."""
+PREFILTER_MARGIN = 6
+"""Pixels around a patch after which the prefilter has forgotten the border (POLE^6 = 4e-4)."""
 ZERO, ONE, TWO, THREE = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
 """Indices of inner loops are unsigned: signed ones cost a test for a negative index, and keep loops from vectors."""
 MEDIAN_FROM = 5
@@ -129,10 +129,18 @@ def matches_of(surface: Floats32, hessian: Floats, block: Floats) -> Matches:
 _matches_of = _jit(matches_of)
 
 
+def new_matches(count: int, radius: int) -> Matches:
+    """Room for the matches of `count` fragments, for a kernel to fill."""
+    surface = np.empty((count, 2 * radius + 1, 2 * radius + 1), np.float32)
+    return matches_of(surface, np.empty((count, 2, 2)), np.empty((count, VALUES)))
+
+
 def no_matches(count: int, radius: int) -> Matches:
-    """Matches of `count` fragments in which nothing was found yet: all NaN."""
-    surface = np.full((count, 2 * radius + 1, 2 * radius + 1), np.nan, np.float32)
-    return matches_of(surface, np.full((count, 2, 2), np.nan), np.full((count, VALUES), np.nan))
+    """Matches of `count` fragments in which nothing was found: all NaN."""
+    matches = new_matches(count, radius)
+    for array in (matches.surface, matches.hessian, matches.block):
+        array[:] = np.nan
+    return matches
 
 
 # ------------------------------------------------------------------------- patches and splines
@@ -723,8 +731,10 @@ def match_one_step(previous, image, centres, search, side, radius, surface, hess
     """The paper's steps 1 and 2 for every fragment: correlation peak (2), (3), one flow step (4)-(9).
 
     `previous`, `image` uint8 [height, width]; `centres`, `search` int64 [F, 2] (u, v): fragment centres in
-    the previous frame and centres of the search areas in this one. Fills the arrays of `no_matches`.
+    the previous frame and centres of the search areas in this one. Fills the arrays of `new_matches`.
     """
+    hessian[:] = np.nan
+    block[:] = np.nan
     m = _matches_of(surface, hessian, block)
     half = (side - 1) // 2
     n = side * side
@@ -765,6 +775,8 @@ def match_iterated(  # type: ignore[no-untyped-def]
 
     `coefficients` float32 [S, S, lanes] from `spline_patches`; the rest as in `match_one_step`.
     """
+    hessian[:] = np.nan
+    block[:] = np.nan
     m = _matches_of(surface, hessian, block)
     t = templates(coefficients, side, rotation_rad)
     template = np.empty((side, side), np.float32)
@@ -962,8 +974,8 @@ def photometric_fit(  # type: ignore[no-untyped-def]
     weight = np.zeros(count)
     residual = np.full((count, 2), np.nan)
     covariance = np.full((4, 4), np.nan)
-    inliers = 0
-    for repeat in range(5):
+    inliers, rests = 0, False
+    for _ in range(6):
         a = np.zeros((4, 4))
         b = np.zeros(4)
         cos, sin = scale * np.cos(rotation_rad), scale * np.sin(rotation_rad)
@@ -988,7 +1000,7 @@ def photometric_fit(  # type: ignore[no-untyped-def]
                 b[p] += ju[p] * (h00 * ru + h01 * rv) + jv[p] * (h01 * ru + h11 * rv)
                 for q in range(4):
                     a[p, q] += ju[p] * (h00 * ju[q] + h01 * jv[q]) + jv[p] * (h01 * ju[q] + h11 * jv[q])
-        if inliers < 2 or repeat == 4:
+        if inliers < 2 or rests:
             break
         covariance = np.linalg.inv(a)
         step = covariance @ b
@@ -996,6 +1008,7 @@ def photometric_fit(  # type: ignore[no-untyped-def]
         mv += step[1]
         rotation_rad += step[2]
         scale *= 1.0 + step[3]
+        rests = abs(step[0]) + abs(step[1]) < 1e-6 and abs(step[2]) + abs(step[3]) < 1e-9
     return Fit(mu, mv, rotation_rad, scale, weight, residual, inliers, covariance[:3, :3].copy())
 
 

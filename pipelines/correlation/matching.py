@@ -138,7 +138,7 @@ class Matcher:
             alarms |= Verdict.SEARCH_OUTSIDE_IMAGE
             if s.prediction == "last-shift":
                 search[outside] = layout.centres[outside]
-        m = kernels.no_matches(len(layout.centres), s.search_radius_px)
+        m = kernels.new_matches(len(layout.centres), s.search_radius_px)
         block = (m.surface, m.hessian, m.block)
         if s.refiner == "one-step":
             turned = 0.0
