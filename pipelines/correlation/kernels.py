@@ -705,10 +705,10 @@ def refine(t, image, base, delta, gain_and_offset, limit, tolerance, hessian, ou
 
 @_jit
 def _note_peaks(matches, i, centre, search, radius):  # type: ignore[no-untyped-def]
-    """Find the peaks of fragment i's surface and note them; False where the surface holds no position."""
+    """Find the peaks of fragment i's surface and note them; False where it is flat or holds no position."""
     surface = matches.surface[i]
     j, k, value, second_j, second_k, second = find_peaks(surface)
-    if j < 0:
+    if j < 0 or value <= 0.0:
         return False
     matches.peak_px[i, 0] = search[i, 0] + k - radius - centre[i, 0]
     matches.peak_px[i, 1] = search[i, 1] + j - radius - centre[i, 1]
@@ -867,7 +867,8 @@ def paper_fit(surface, hessian, block, points, step_limit, gimballed, covariance
     """The paper's motion from two fragments, the rear one first: (10)-(13), (15).
 
     A Δ longer than `step_limit` is rejected, not clipped: the integer shift stands. Notes shift, weight and
-    residual in the block; `covariance` [3, 3] of (m_x0, n_y0, Δα) receives that of the fragments' σ.
+    residual in the block; `covariance` [3, 3] of (m_x0, n_y0, Δα) receives that of the fragments' σ, the search
+    radius where a fragment has no σ.
 
     Returns (m_x0, n_y0, Δα, scale); NaN where a fragment has no peak.
     """
@@ -885,8 +886,13 @@ def paper_fit(surface, hessian, block, points, step_limit, gimballed, covariance
         m.weight[i] = 1.0 if np.isfinite(rotation + u) else 0.0
         m.fit_residual_px[i, 0] = points[i, 0] + m.shift_px[i, 0] - (cos * points[i, 0] - sin * points[i, 1] + u)
         m.fit_residual_px[i, 1] = points[i, 1] + m.shift_px[i, 1] - (sin * points[i, 0] + cos * points[i, 1] + v)
-    rear_u, rear_v = m.sigma_px[0, 0] ** 2, m.sigma_px[0, 1] ** 2
-    front_u, front_v = m.sigma_px[1, 0] ** 2, m.sigma_px[1, 1] ** 2
+    radius = m.surface.shape[1] // 2
+    variance = np.empty((2, 2))
+    for i in range(2):
+        for axis in range(2):
+            sigma = m.sigma_px[i, axis]
+            variance[i, axis] = sigma * sigma if np.isfinite(sigma) else float(radius * radius)
+    rear_u, rear_v, front_u, front_v = variance[0, 0], variance[0, 1], variance[1, 0], variance[1, 1]
     covariance[:] = 0.0
     covariance[0, 0], covariance[1, 1] = (front_u + rear_u) / 4.0, (front_v + rear_v) / 4.0
     covariance[2, 2] = (front_v + rear_v) / (distance * distance)
@@ -1000,7 +1006,7 @@ def photometric_fit(  # type: ignore[no-untyped-def]
                 b[p] += ju[p] * (h00 * ru + h01 * rv) + jv[p] * (h01 * ru + h11 * rv)
                 for q in range(4):
                     a[p, q] += ju[p] * (h00 * ju[q] + h01 * jv[q]) + jv[p] * (h01 * ju[q] + h11 * jv[q])
-        if inliers < 2 or rests:
+        if inliers < 2 or rests or not np.linalg.det(a) > 0.0:
             break
         covariance = np.linalg.inv(a)
         step = covariance @ b
