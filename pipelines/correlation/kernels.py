@@ -429,10 +429,23 @@ def correlation_surface(template, image, u, v, radius, surface):  # type: ignore
 
 
 @_jit
-def find_peaks(surface):  # type: ignore[no-untyped-def]
-    """Highest position of a surface, and the highest local maximum outside its hill.
+def _is_hilltop(surface, j, i):  # type: ignore[no-untyped-def]
+    """Whether no neighbour of a position is higher."""
+    size = surface.shape[0]
+    for y in range(max(j - 1, 0), min(j + 2, size)):
+        for x in range(max(i - 1, 0), min(i + 2, size)):
+            if surface[y, x] > surface[j, i]:
+                return False
+    return True
 
-    Returns (row, column, value, second row, second column, second value); rows of -1 where there is none.
+
+@_jit
+def find_peaks(surface, ambiguity):  # type: ignore[no-untyped-def]
+    """The peak of a surface, and the highest local maximum outside its hill.
+
+    The peak is the highest position; of local maxima that are lower by at most `ambiguity` it is the one nearest
+    to the middle, that is, to the prediction. Returns (row, column, value, second row, second column, second
+    value); rows of -1 where there is none.
     """
     size = surface.shape[0]
     best_j, best_i, best = -1, -1, -2.0
@@ -440,19 +453,20 @@ def find_peaks(surface):  # type: ignore[no-untyped-def]
         for i in range(size):
             if surface[j, i] > best:
                 best_j, best_i, best = j, i, surface[j, i]
+    if ambiguity > 0.0 and best_j >= 0:
+        middle, least = size // 2, best - ambiguity
+        nearest = (best_j - middle) ** 2 + (best_i - middle) ** 2
+        for j in range(size):
+            for i in range(size):
+                distance = (j - middle) ** 2 + (i - middle) ** 2
+                if surface[j, i] >= least and distance < nearest and _is_hilltop(surface, j, i):
+                    best_j, best_i, best, nearest = j, i, surface[j, i], distance
     second_j, second_i, second = -1, -1, -2.0
     for j in range(size):
         for i in range(size):
-            value = surface[j, i]
-            if not value > second or (abs(j - best_j) <= HILL_PX and abs(i - best_i) <= HILL_PX):
-                continue
-            highest = True
-            for y in range(max(j - 1, 0), min(j + 2, size)):
-                for x in range(max(i - 1, 0), min(i + 2, size)):
-                    if surface[y, x] > value:
-                        highest = False
-            if highest:
-                second_j, second_i, second = j, i, value
+            beside = abs(j - best_j) <= HILL_PX and abs(i - best_i) <= HILL_PX
+            if surface[j, i] > second and not beside and _is_hilltop(surface, j, i):
+                second_j, second_i, second = j, i, surface[j, i]
     return best_j, best_i, best, second_j, second_i, second
 
 
@@ -704,10 +718,10 @@ def refine(t, image, base, delta, gain_and_offset, limit, tolerance, hessian, ou
 
 
 @_jit
-def _note_peaks(matches, i, centre, search, radius):  # type: ignore[no-untyped-def]
+def _note_peaks(matches, i, centre, search, radius, ambiguity):  # type: ignore[no-untyped-def]
     """Find the peaks of fragment i's surface and note them; False where it is flat or holds no position."""
     surface = matches.surface[i]
-    j, k, value, second_j, second_k, second = find_peaks(surface)
+    j, k, value, second_j, second_k, second = find_peaks(surface, ambiguity)
     if j < 0 or value <= 0.0:
         return False
     matches.peak_px[i, 0] = search[i, 0] + k - radius - centre[i, 0]
@@ -743,7 +757,7 @@ def match_one_step(previous, image, centres, search, side, radius, surface, hess
         u, v = centres[i]
         _copy_window(previous, v - half, u - half, template)
         correlation_surface(template, image, search[i, 0], search[i, 1], radius, m.surface[i])
-        if not _note_peaks(m, i, centres, search, radius):
+        if not _note_peaks(m, i, centres, search, radius, 0.0):
             continue
         pu, pv = int(m.peak_px[i, 0]), int(m.peak_px[i, 1])
         m.delta_px[i, 0], m.delta_px[i, 1], m.residual_rms[i] = one_step(
@@ -768,12 +782,13 @@ def match_one_step(previous, image, centres, search, side, radius, surface, hess
 
 @_jit
 def match_iterated(  # type: ignore[no-untyped-def]
-    coefficients, image, centres, search, rotation_rad, side, radius, gain_and_offset, limit, tolerance,
+    coefficients, image, centres, search, rotation_rad, side, radius, ambiguity, gain_and_offset, limit, tolerance,
     surface, hessian, block,
 ):  # fmt: skip
     """Correlation peak with the turned templates, then the iterated refinement, for every fragment.
 
-    `coefficients` float32 [S, S, lanes] from `spline_patches`; the rest as in `match_one_step`.
+    `coefficients` float32 [S, S, lanes] from `spline_patches`, `ambiguity` as in `find_peaks`; the rest as in
+    `match_one_step`.
     """
     hessian[:] = np.nan
     block[:] = np.nan
@@ -786,7 +801,7 @@ def match_iterated(  # type: ignore[no-untyped-def]
                 template[y, x] = t[0, y, x, i]
         correlation_surface(template, image, search[i, 0], search[i, 1], radius, m.surface[i])
         m.iterations[i] = 0
-        _note_peaks(m, i, centres, search, radius)
+        _note_peaks(m, i, centres, search, radius, ambiguity)
     _refine_matches(m, t, image, centres, gain_and_offset, limit, tolerance)
 
 

@@ -186,7 +186,8 @@ class CorrelationOdometry:
         residual = median(candidate.matches.residual_rms)
         # over the squared mean, a longer exposure does not pass for a sharper image
         sharpness = gradient / max(mean_grey, 1.0) ** 2
-        alarms |= alarms_over_time(s, residual, sharpness, dt_s, mean_grey - state.mean_grey, state.usual)
+        gain = median(candidate.matches.gain)
+        alarms |= alarms_over_time(s, residual, gain, sharpness, dt_s, mean_grey - state.mean_grey, state.usual)
         accepted = candidate.acceptable
         if not accepted:
             alarms |= Verdict.LOST
