@@ -503,6 +503,14 @@ def test_size_change_begins_again(short_drive: Drive) -> None:
     assert steps[4].image_size_px.tolist() == [480, 400]
 
 
+def test_a_thumbnail_among_frames_is_passed_over(short_drive: Drive) -> None:
+    samples = short_drive.samples()[:8]
+    samples[4] = image(np.ascontiguousarray(short_drive.frames[4][::16, ::16]), 4)
+    steps = run(settings("best", start_pose=tuple(short_drive.poses[0])), samples)
+    assert alarms_at(steps, Verdict.SIZE_CHANGED) == {4}
+    assert np.hypot(*(steps[-1].pose - short_drive.poses[7])[:2]) < 5e-4
+
+
 # ------------------------------------------------------------------------------------- contract
 
 

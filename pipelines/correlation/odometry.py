@@ -348,7 +348,12 @@ class CorrelationOdometry:
         self, state: CorrelationState, sample: ImageSample, grey: Grey, verdict: Verdict
     ) -> tuple[CorrelationState, CorrelationStep]:
         """Begin, or begin again after the image size changed: there is nothing to compare this frame with."""
-        self._matcher.layout(grey.shape[1], grey.shape[0])
+        try:
+            self._matcher.layout(grey.shape[1], grey.shape[0])
+        except EstimatorError:
+            if verdict is Verdict.FIRST_FRAME:
+                raise
+            return self._skip(state, sample, verdict, None)  # a small picture among larger ones
         assert state.covariance is not None
         frame = _frame_of(state, sample)
         this = Template(frame, grey, state.pose, state.covariance)
