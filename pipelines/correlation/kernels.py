@@ -26,6 +26,7 @@ POLE = 3.0**0.5 - 2.0
 PREFILTER_MARGIN = 6
 """Pixels around a patch after which the prefilter has forgotten the border (POLE^6 = 4e-4)."""
 ZERO, ONE, TWO, THREE = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
+FOUR, FIVE, SIX = np.uint64(4), np.uint64(5), np.uint64(6)
 """Indices of inner loops are unsigned: signed ones cost a test for a negative index, and keep loops from vectors."""
 MEDIAN_FROM = 5
 """A running median counts from this many values on."""
@@ -288,12 +289,20 @@ def _basis_5(t):  # type: ignore[no-untyped-def]
 @_jit
 def _cardinal_weights(fraction, weights):  # type: ignore[no-untyped-def]
     """Weights of the TAPS pixels around a position, `fraction` after the (TAPS/2)th of them (quintic spline)."""
+    basis = (
+        _basis_5(fraction + 2.0),
+        _basis_5(fraction + 1.0),
+        _basis_5(fraction),
+        _basis_5(fraction - 1.0),
+        _basis_5(fraction - 2.0),
+        _basis_5(fraction - 3.0),
+    )
     total = 0.0
     first = 1 - TAPS // 2
     for k in range(TAPS):
         w = 0.0
-        for m in range(-2, 4):
-            w += _basis_5(fraction - m) * _CARDINAL[TAPS + k + first - m]
+        for m in range(6):
+            w += basis[m] * _CARDINAL[TAPS + k + first - (m - 2)]
         weights[k] = w
         total += w
     for k in range(TAPS):
@@ -317,20 +326,29 @@ def _shifted(image, u, v, work, out, lane):  # type: ignore[no-untyped-def]
     _cardinal_weights(v - iv, weights_v)
     before = TAPS // 2 - 1
     _copy_window(image, iv - half - before, iu - half - before, window)
-    width, size = np.uint64(window.shape[1]), np.uint64(side)
+    # whole vectors: what lies beyond the fragment is computed and left
+    width, padded, size = np.uint64(window.shape[1]), np.uint64(len(target)), np.uint64(side)
     for y in range(size):
         for x in range(width):
             row[x] = 0.0
-        for k in range(ZERO, np.uint64(TAPS), THREE):
+        for k in range(ZERO, np.uint64(TAPS), SIX):
             w0, w1, w2 = np.float32(weights_v[k]), np.float32(weights_v[k + ONE]), np.float32(weights_v[k + TWO])
+            w3, w4 = np.float32(weights_v[k + THREE]), np.float32(weights_v[k + FOUR])
+            w5 = np.float32(weights_v[k + FIVE])
             for x in range(width):
-                row[x] += w0 * window[y + k, x] + w1 * window[y + k + ONE, x] + w2 * window[y + k + TWO, x]
-        for x in range(size):
+                near = w2 * window[y + k + TWO, x] + w3 * window[y + k + THREE, x]
+                far = w0 * window[y + k, x] + w5 * window[y + k + FIVE, x]
+                row[x] += near + far + (w1 * window[y + k + ONE, x] + w4 * window[y + k + FOUR, x])
+        for x in range(padded):
             target[x] = 0.0
-        for k in range(ZERO, np.uint64(TAPS), THREE):
+        for k in range(ZERO, np.uint64(TAPS), SIX):
             w0, w1, w2 = np.float32(weights_u[k]), np.float32(weights_u[k + ONE]), np.float32(weights_u[k + TWO])
-            for x in range(size):
-                target[x] += w0 * row[x + k] + w1 * row[x + k + ONE] + w2 * row[x + k + TWO]
+            w3, w4 = np.float32(weights_u[k + THREE]), np.float32(weights_u[k + FOUR])
+            w5 = np.float32(weights_u[k + FIVE])
+            for x in range(padded):
+                near = w2 * row[x + k + TWO] + w3 * row[x + k + THREE]
+                far = w0 * row[x + k] + w5 * row[x + k + FIVE]
+                target[x] += near + far + (w1 * row[x + k + ONE] + w4 * row[x + k + FOUR])
         for x in range(size):
             out[y, x, lane] = target[x]
 
@@ -552,11 +570,11 @@ class _Scratch(NamedTuple):
 
 @_jit
 def _scratch(side):  # type: ignore[no-untyped-def]
-    width = side + TAPS - 1
+    whole, width = (side + 7) // 8 * 8, (side + TAPS - 1 + 7) // 8 * 8
     return _Scratch(
-        np.empty((width, width), np.float32),
-        np.empty(width, np.float32),
-        np.empty(side, np.float32),
+        np.empty((side + TAPS - 1, width), np.float32),
+        np.zeros(max(width, whole + TAPS), np.float32),
+        np.empty(whole, np.float32),
         np.empty(TAPS),
         np.empty(TAPS),
     )
