@@ -324,18 +324,19 @@ def test_a_calibration_for_another_size_is_not_used(toys: Path, shell: Shell, mo
 def test_the_scale_is_calibrated_against_the_reference(
     toys: Path, shell: Shell, words: list[str], key: str, value: float
 ) -> None:
-    got = shell.replay("walk.log", "--json", "--calibrate-scale", *words).json["calibration"]
+    got = shell.replay("walk.log", "--json", "--calibrate", *words).json["calibration"]
     assert got["key"] == key
     assert got["least_squares"] == pytest.approx(value)
     assert got["path_ratio"] == pytest.approx(value)
-    assert f"--set {key}={value:g}" in shell.replay("walk.log", "--calibrate-scale", *words).out
+    assert f"--set {key}={value:g}" in shell.replay("walk.log", "--calibrate", *words).out
 
 
 def test_a_calibration_without_reference_is_refused(toys: Path, shell: Shell) -> None:
-    assert "needs a reference" in shell.replay("walk.log", "--calibrate-scale", "--reference", "none").error
-    said = shell.replay("walk.log", "--calibrate-scale", "--to", "0.05")
+    assert "needs a reference" in shell.replay("walk.log", "--calibrate", "--reference", "none").error
+    said = shell.replay("walk.log", "--calibrate", "--to", "0.05")
     assert said.status == 2
     assert "cannot be compared" in said.err
+    assert tomllib.loads(Path("results/walk/best.toml").read_text())["complete"]
 
 
 # --------------------------------------------------------------------------------- damage
@@ -501,7 +502,7 @@ def test_help_imports_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
-    assert "--calibrate-scale" in done.stdout
+    assert "--calibrate" in done.stdout
 
 
 @pytest.mark.parametrize("command", [[], ["inspect"], ["replay"], ["view"], ["demo"], ["settings"]])

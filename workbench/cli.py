@@ -225,8 +225,8 @@ def replay(
     height: Annotated[
         str | None, typer.Option(metavar="TOPIC", help="Range, number or pose (z) stream of the camera's height.")
     ] = None,
-    calibrate_scale: Annotated[
-        bool, typer.Option("--calibrate-scale", help="Tell the scale that fits the reference best.")
+    calibrate: Annotated[
+        bool, typer.Option("--calibrate", help="Tell the scale and mounting yaw that fit the reference.")
     ] = False,
     raw_images: Annotated[str, typer.Option(metavar="FORM", help="Keep raw images as png or raw.")] = "png",
     rate: Rate = None,
@@ -267,7 +267,7 @@ def replay(
         reference_offset_s=reference_offset,
         height=height,
         options=_options(rate, times, times_unit, tf),
-        calibrate_scale=calibrate_scale,
+        calibrate=calibrate,
         raw_images=_one_of(raw_images, ("png", "raw"), "--raw-images"),
     )
     outcome = _replay(request)
@@ -295,7 +295,7 @@ def _status(outcome: Outcome) -> int:
         return IN_PART
     calibration = summary["calibration"]
     if calibration is not None and not calibration["key"]:
-        _error(f"--calibrate-scale: {calibration['sentence']}")
+        _error(f"--calibrate: {calibration['sentence']}")
         return REFUSED
     return 0
 

@@ -228,9 +228,38 @@ def load_reference(
     lower = None if start_ns is None else start_ns + offset_ns - MARGIN_NS
     upper = None if stop_ns is None else stop_ns + offset_ns + MARGIN_NS
     poses = reference_poses(_while_readable(recording.read([stream], lower, upper)))
-    if not poses:
-        return Reference("", f"none: {stream} holds no position in this window")
-    return Reference(stream, sentence, poses)
+    if poses:
+        return Reference(stream, sentence, poses)
+    return _no_reference(recording, f"{stream} holds no position in this window", wanted)
+
+
+def overlapping(
+    recording: Recording, reference: Reference, wanted: str | None, image: str, first_ns: int, offset_ns: int
+) -> Reference:
+    """The same reference, or none if all of it lies before the first image or after the last one.
+
+    Raises:
+        StreamError: it was asked for by name.
+    """
+    if not reference.poses:
+        return reference
+    images = recording.stream(image)
+    last_ns = images.last_ns + max(0, first_ns - images.first_ns)
+    begin, end = reference.poses[0].t_ns - offset_ns, reference.poses[-1].t_ns - offset_ns
+    if end >= first_ns and (images.last_ns < 0 or begin <= last_ns + MARGIN_NS):
+        return reference
+    problem = (
+        f"{reference.stream} lies from {begin / 1e9:.3f} to {end / 1e9:.3f} s, at another time than the images, which "
+        f"begin at {first_ns / 1e9:.3f} s; look at --reference-offset"
+    )
+    return _no_reference(recording, problem, wanted)
+
+
+def _no_reference(recording: Recording, problem: str, wanted: str | None) -> Reference:
+    """No reference where it was only supposed, an error where it was asked for."""
+    if wanted is not None:
+        raise StreamError(f"{recording.path}: {problem}; choose another with --reference, or none")
+    return Reference("", f"none: {problem}")
 
 
 def _while_readable(samples: Iterator[Sample]) -> Iterator[Sample]:

@@ -26,8 +26,8 @@ from typing import Any, NamedTuple, Protocol, Self, TextIO
 import numpy as np
 
 from pipelines.estimator import Estimator, Step
-from pipelines.evaluation import Evaluation, EvaluationError, Trajectory, evaluate, path_lengths
-from pipelines.geometry import Floats
+from pipelines.evaluation import Evaluation, EvaluationError, Trajectory, evaluate, mean_angle, path_lengths
+from pipelines.geometry import Floats, wrap_angle
 from pipelines.replay import Replayed, replay
 from pipelines.verdict import Severity
 from readers.clock import StreamAudit
@@ -79,7 +79,7 @@ class Request:
     reference_offset_s: float = 0.0
     height: str | None = None
     options: ReadOptions = field(default_factory=ReadOptions)
-    calibrate_scale: bool = False
+    calibrate: bool = False
     raw_images: str = "png"
 
 
@@ -251,8 +251,9 @@ def _prepare(
     first = inputs.first_frame(recording, image, start_ns, stop_ns)
     offset_ns = round(request.reference_offset_s * 1e9)
     reference = inputs.load_reference(recording, request.reference, start_ns, stop_ns, offset_ns)
-    if request.calibrate_scale and not reference.poses:
-        raise StreamError(f"{request.path}: --calibrate-scale needs a reference, but there is {reference.sentence}")
+    reference = inputs.overlapping(recording, reference, request.reference, image, first.t_ns, offset_ns)
+    if request.calibrate and not reference.poses:
+        raise StreamError(f"{request.path}: --calibrate needs a reference, but there is {reference.sentence}")
     height = inputs.choose_height(recording, request.height)
     resolved, scale, notes = inputs.with_scale(resolved, recording, image, first.size_px, height)
     resolved = inputs.with_start(resolved, reference, first.t_ns + offset_ns)
@@ -506,20 +507,18 @@ class _Session:
             "reference": reference,
             "evaluation": None if evaluation is None else evaluation_values(evaluation),
             "calibration": self._calibration(evaluation),
-            "suitability": suitability(tally, median_dt_s),
+            "suitability": suitability(tally, median_dt_s, evaluation),
             "notes": self.notes,
             "interrupted": interrupted,
             "stopped_early": stopped,
         }
 
     def _calibration(self, evaluation: Evaluation | None) -> dict[str, Any] | None:
-        """The price of a pixel (or the focal length) that brings the path over the reference."""
-        if not self.request.calibrate_scale:
+        """The settings that bring the path over the reference, None if nobody asked."""
+        if not self.request.calibrate:
             return None
         if evaluation is None:
-            raise EvaluationError(
-                f"{self.request.path}: --calibrate-scale: the run cannot be compared with a reference"
-            )
+            return {"key": "", "sentence": "not possible: the run cannot be compared with a reference"}
         return calibration(self.estimator.settings, evaluation)
 
     # ---- files
@@ -597,7 +596,8 @@ class _Session:
 def calibration(settings: Any, evaluation: Evaluation) -> dict[str, Any]:
     """What the scale settings would have to be, by least squares over the positions and by path length.
 
-    Where no scale can be told, `key` is empty and `sentence` says why.
+    Where the reference has headings, also the mounting yaw: a path that is turned against its own headings comes
+    of a camera that is turned in the vehicle. Where no scale can be told, `key` is empty and `sentence` says why.
     """
     key = "metres_per_px" if getattr(settings, "metres_per_px", None) is not None else "focal_px"
     used = getattr(settings, key, None)
@@ -608,10 +608,15 @@ def calibration(settings: Any, evaluation: Evaluation) -> dict[str, Any]:
     by_length = evaluation.alignment.scale * evaluation.reference_path_m / evaluation.path_m
     factors = evaluation.fitted_scale, by_length
     fit, ratio = (used * f if key == "metres_per_px" else used / f for f in factors)
+    found = {"key": key, "least_squares": fit, "path_ratio": ratio}
     sentence = f"{key} = {fit:.6g} by least squares, {ratio:.6g} by path length; use --set {key}={fit:.6g}"
+    offsets = evaluation.errors[:, 3]
+    if np.isfinite(offsets).any() and hasattr(settings, "mounting_yaw_rad"):
+        found["mounting_yaw_rad"] = wrap_angle(settings.mounting_yaw_rad + mean_angle(offsets))
+        sentence += f" --set mounting_yaw_rad={found['mounting_yaw_rad']:.4f}"
     if abs(ratio / fit - 1) > CALIBRATION_AGREES:
-        sentence += ", with care: the two do not agree, so that the path's shape is wrong, not only its scale"
-    return {"key": key, "least_squares": fit, "path_ratio": ratio, "sentence": sentence}
+        sentence += "; with care: the two do not agree, so that the path's shape is wrong, not only its scale"
+    return found | {"sentence": sentence}
 
 
 def tum_line(t_ns: int, pose: Floats) -> str:
