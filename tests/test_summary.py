@@ -27,7 +27,7 @@ def tally(frames: int, **alarms: int) -> Tally:
 
 def test_a_good_run_is_called_good() -> None:
     assert suitability(tally(101), 0.016) == [
-        "100 % of the motions passed every check; nothing in the images speaks against it"
+        "100 % of the motions passed every check; nothing in the images speaks against the method"
     ]
 
 

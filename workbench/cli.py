@@ -11,6 +11,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -29,6 +30,9 @@ EPOCH_NS = 100_000_000_000_000_000
 WIDEST = 60
 BAR_SECONDS = 0.1
 LINE_SECONDS = 5.0
+PATIENCE_SECONDS = 2.0
+
+FIRST_START = "the first start compiles the estimator, which takes up to a minute; later ones do not"
 
 app = typer.Typer(
     name="workbench",
@@ -538,18 +542,23 @@ class _Bar:
         self._task: Any = None
         self._told = time.monotonic()
         self._began = self._told
+        self._patience = threading.Timer(PATIENCE_SECONDS, self._console, ["no frame yet: " + FIRST_START])
+        self._patience.daemon = True
 
     def __enter__(self) -> Self:
+        self._patience.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._patience.cancel()
         if self._live is not None:
             self._live.stop()
 
     def __call__(self, progress: Progress) -> None:
         """Take note of a frame; show it if the last time is long enough ago."""
+        self._patience.cancel()
         now = time.monotonic()
         terminal = sys.stderr.isatty()
         if now - self._told < (BAR_SECONDS if terminal else LINE_SECONDS) and progress.done != progress.total:
@@ -560,7 +569,10 @@ class _Bar:
         else:
             of = "" if progress.total is None else f" of {progress.total}"
             speed = progress.done / max(now - self._began, 1e-9)
-            print(f"{self._title}: frame {progress.done}{of}, {speed:.0f} frames/s", file=sys.stderr, flush=True)
+            self._console(f"frame {progress.done}{of}, {speed:.0f} frames/s")
+
+    def _console(self, text: str) -> None:
+        print(f"{self._title}: {text}", file=sys.stderr, flush=True)
 
     def _draw(self, progress: Progress) -> None:
         if self._live is None:

@@ -19,6 +19,7 @@ import tomllib
 from array import array
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple, Protocol, Self, TextIO
@@ -126,17 +127,29 @@ class RunLog(Protocol):
 
 
 class Writers(NamedTuple):
-    """The classes that write the two kinds of files."""
+    """What makes the writers of the two kinds of files.
+
+    Both are called with the file and, by name, the `recording_id`, the `run`, the name of its `estimator` and its
+    `step_type`; `sensors` with `raw_images` as well, `run` with `settings_text` and the positions of the reference,
+    `reference_xy` [n, 2] in m (none where the path is not in metres).
+    """
 
     sensors: Callable[..., SensorLog]
     run: Callable[..., RunLog]
 
 
 def rerun_writers() -> Writers:
-    """The writers of Rerun recordings."""
+    """The writers of Rerun recordings; both files bring the view of the run along, whichever is opened last."""
+    from workbench.blueprints import Extent, blueprint_of
     from workbench.rrd import RunWriter, SensorWriter
 
-    return Writers(SensorWriter, RunWriter)
+    def sensors(file: Path, *, run: str, estimator: str, step_type: type[Step], **options: Any) -> SensorLog:
+        return SensorWriter(file, view=partial(blueprint_of, step_type, run, estimator), **options)
+
+    def run(file: Path, *, reference_xy: Floats, **options: Any) -> RunLog:
+        return RunWriter(file, extent=Extent.of(reference_xy) if len(reference_xy) else None, **options)
+
+    return Writers(sensors, run)
 
 
 # ------------------------------------------------------------------------------ interrupt
@@ -372,8 +385,12 @@ class _Session:
 
     def replay(self, writers: Writers, interrupt: Interrupt, on_progress: Callable[[Progress], None] | None) -> Outcome:
         """Replay, judge and write."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self._write_toml({"complete": False})
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._write_toml({"complete": False})
+        except OSError as error:
+            problem = f"no results can be written there ({error.strerror or error})"
+            raise RecordingError(self.folder, problem, "choose another folder with -o") from error
         tally, path, stopped = Tally(), _Path(), ""
         with contextlib.ExitStack() as files:
             sensors = self._sensors(writers, files)
@@ -533,7 +550,14 @@ class _Session:
         if file.is_file() and record.is_file() and tomllib.loads(record.read_text("utf-8")) == tomllib.loads(wanted):
             return None
         record.unlink(missing_ok=True)
-        writer = writers.sensors(file, recording_id=self.recording_id, raw_images=self.request.raw_images)
+        writer = writers.sensors(
+            file,
+            recording_id=self.recording_id,
+            raw_images=self.request.raw_images,
+            run=self.name,
+            estimator=self.estimator.name,
+            step_type=self.estimator.step_type,
+        )
         files.enter_context(contextlib.closing(writer))
         writer.reference(self.reference.poses)
         return writer
@@ -546,6 +570,7 @@ class _Session:
             estimator=self.estimator.name,
             step_type=self.estimator.step_type,
             settings_text=to_toml(settings_values(self.estimator.settings)),
+            reference_xy=self.reference.path.pose[:, :2] if self.scale.known else np.empty((0, 2)),
         )
 
     @property

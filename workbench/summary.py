@@ -128,7 +128,7 @@ def _upshot(tally: Tally, doubts: bool) -> str:
     sentence = ", ".join([good, *parts])
     if held + failed > 1 - TRUSTED_SHARE:
         return f"do not trust this path: {sentence}"
-    return f"{sentence}; look at what follows" if doubts else f"{sentence}; nothing in the images speaks against it"
+    return f"{sentence}; look at what follows" if doubts else f"{sentence}; nothing in the images speaks against the method"
 
 
 def _grave(alarms: Verdict, severity: Severity) -> bool:
