@@ -21,7 +21,7 @@ import workbench.session
 import workbench.settings
 from readers.streams import Fact, StreamKind, WorkbenchError
 from tests import toy_session
-from tests.toy_session import START, TextLog, ToyMission
+from tests.toy_session import START, TextLog, ToyMission, ToyRun
 from tests.toys import image
 from workbench.cli import files_of, main, moment, shown, table, view_command
 from workbench.inputs import digest, parse_time
@@ -480,6 +480,33 @@ def test_an_interrupt_ends_with_status_130_and_whole_files(tmp_path: Path, numbe
     assert sum(line.startswith("step") for line in steps) == summary["frames"]
     assert steps[-1].startswith("finish")
     assert not (folder / "sensors.toml").exists()
+
+
+def test_a_second_interrupt_ends_at_once_and_is_noted(
+    toys: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(self: ToyRun, *_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ToyRun, "finish", interrupted)
+    assert shell.replay("walk.log").status == 130
+    state = tomllib.loads(Path("results/walk/best.toml").read_text())
+    assert (state["complete"], state["interrupted"]) == (False, True)
+    assert len(Path("results/walk/best.tum").read_text().splitlines()) == 40
+
+
+def test_a_reference_of_another_time_is_refused_where_it_was_asked_for(toys: Path, shell: Shell) -> None:
+    words = ["--reference-offset", "1000"]
+    assert "at another time than the images" in shell.replay("walk.log", "--reference", "/truth", *words).error
+    assert not Path("results").exists()
+    summary = shell.replay("walk.log", "--json", *words).json
+    assert summary["reference"].startswith("none: /truth lies from")
+
+
+def test_a_folder_that_cannot_be_made_is_named(toys: Path, shell: Shell) -> None:
+    Path("full.txt").touch()
+    said = shell.replay("walk.log", "-o", "full.txt/deeper")
+    assert "full.txt/deeper: no results can be written there" in said.error
 
 
 def test_status_and_streams_of_the_real_command(tmp_path: Path) -> None:

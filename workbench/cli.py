@@ -47,7 +47,14 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
+    context_settings={"max_content_width": 100},
 )
+
+
+def _examples(*lines: str) -> str:
+    """Examples below a command's help, line by line as they stand."""
+    return "\n  ".join(("\b\nExamples:", *lines))
+
 
 RecordingPath = Annotated[
     Path, typer.Argument(metavar="PATH", help="ROS 1 bag, ROS 2 bag, MCAP, image folder or video", show_default=False)
@@ -74,7 +81,14 @@ def _common(
 # -------------------------------------------------------------------------------- inspect
 
 
-@app.command(short_help="What is in a recording, and what is odd about it.")
+@app.command(
+    short_help="What is in a recording, and what is odd about it.",
+    epilog=_examples(
+        "workbench inspect mission.bag",
+        "workbench inspect frames/ --rate 30",
+        "workbench inspect mission.mcap --json | jq '.streams[].name'",
+    ),
+)
 def inspect(
     path: RecordingPath,
     as_json: AsJson = False,
@@ -84,14 +98,7 @@ def inspect(
     times_unit: TimesUnit = "auto",
     tf: TimeFrames = None,
 ) -> None:
-    r"""Show what is in a recording: streams, cameras, damage, and what is odd about its clocks.
-
-    \b
-    Examples:
-      workbench inspect mission.bag
-      workbench inspect frames/ --rate 30
-      workbench inspect mission.mcap --json | jq '.streams[].name'
-    """
+    """Show what is in a recording: streams, cameras, damage, and what is odd about its clocks."""
     from workbench.session import open_any
 
     with open_any(path, _options(rate, times, times_unit, tf)) as recording:
@@ -198,7 +205,17 @@ def _camera_text(camera: Camera) -> str:
 # --------------------------------------------------------------------------------- replay
 
 
-@app.command(short_help="Replay a recording; write all that was computed.")
+@app.command(
+    short_help="Replay a recording; write all that was computed.",
+    epilog=_examples(
+        "workbench replay mission.bag",
+        "workbench replay mission.bag --preset paper-a --from 10 --to 20",
+        "workbench replay mission.bag --set search_radius_px=16 --name wide",
+        "workbench replay mission.bag --set metres_per_px=0.00078",
+        "workbench replay mission.bag --height /lidar/range --reference /mocap/pose",
+        "workbench replay frames/ --rate 60 --times times.txt --json",
+    ),
+)
 def replay(
     path: RecordingPath,
     estimator: Annotated[str, typer.Option("--estimator", "-e", help="Name of the estimator.")] = "correlation",
@@ -239,19 +256,10 @@ def replay(
     tf: TimeFrames = None,
     as_json: AsJson = False,
 ) -> None:
-    r"""Replay a recording through an estimator; write all it computed, and a summary.
+    """Replay a recording through an estimator; write all it computed, and a summary.
 
     The folder of the results then holds sensors.rrd, RUN.rrd, RUN.toml (settings, versions, summary) and RUN.tum
     (trajectory). Ctrl-C ends the replay early and loses nothing.
-
-    \b
-    Examples:
-      workbench replay mission.bag
-      workbench replay mission.bag --preset paper-a --from 10 --to 20
-      workbench replay mission.bag --set search_radius_px=16 --name wide
-      workbench replay mission.bag --set metres_per_px=0.00078
-      workbench replay mission.bag --height /lidar/range --reference /mocap/pose
-      workbench replay frames/ --rate 60 --times times.txt --json
     """
     from workbench.session import Request
 
@@ -325,22 +333,23 @@ def _print_summary(outcome: Outcome) -> None:
 # ----------------------------------------------------------------------------------- view
 
 
-@app.command(short_help="Look at one or several runs in the Rerun viewer.")
+@app.command(
+    short_help="Look at one or several runs in the Rerun viewer.",
+    epilog=_examples(
+        "workbench view results/mission",
+        "workbench view results/mission/best.rrd results/mission/paper-a.rrd",
+        "workbench view results/mission --web",
+    ),
+)
 def view(
     runs: Annotated[
         list[Path], typer.Argument(metavar="RUN...", help="RUN.rrd files, or folders of results", show_default=False)
     ],
     web: Annotated[bool, typer.Option("--web", help="Show it in the browser, served on this machine only.")] = False,
 ) -> None:
-    r"""Open the Rerun viewer with one or several runs and the images that belong to them.
+    """Open the Rerun viewer with one or several runs and the images that belong to them.
 
     Without a display the command that would open it is printed.
-
-    \b
-    Examples:
-      workbench view results/mission
-      workbench view results/mission/best.rrd results/mission/paper-a.rrd
-      workbench view results/mission --web
     """
     command = view_command(files_of(runs), web=web)
     if not web and not _has_display():
@@ -390,19 +399,19 @@ def _has_display() -> bool:
 # ----------------------------------------------------------------------------------- demo
 
 
-@app.command(short_help="Replay the built-in recording.")
+@app.command(
+    short_help="Replay the built-in recording.",
+    epilog=_examples(
+        "workbench demo && workbench view results/demo",
+    ),
+)
 def demo(
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of the results.")] = Path(
         "results/demo"
     ),
     as_json: AsJson = False,
 ) -> None:
-    r"""Replay the built-in recording with both presets and say how to look at the result.
-
-    \b
-    Example:
-      workbench demo && workbench view results/demo
-    """
+    """Replay the built-in recording with both presets and say how to look at the result."""
     from workbench.session import Request
 
     path = demo_recording()
@@ -440,18 +449,18 @@ def demo_recording() -> Path:
 # ------------------------------------------------------------------------------- settings
 
 
-@app.command(short_help="Print the settings of a preset as a settings file.")
+@app.command(
+    short_help="Print the settings of a preset as a settings file.",
+    epilog=_examples(
+        "workbench settings --preset paper-a > mine.toml",
+        "workbench replay mission.bag --settings mine.toml",
+    ),
+)
 def settings(
     estimator: Annotated[str, typer.Option("--estimator", "-e", help="Name of the estimator.")] = "correlation",
     preset: Annotated[str | None, typer.Option(help="Preset of its settings.")] = None,
 ) -> None:
-    r"""Print the settings of a preset as a settings file, each with what it is.
-
-    \b
-    Example:
-      workbench settings --preset paper-a > mine.toml
-      workbench replay mission.bag --settings mine.toml
-    """
+    """Print the settings of a preset as a settings file, each with what it is."""
     from workbench.settings import described, plugin, settings_values, to_toml
 
     chosen = plugin(estimator)

@@ -384,13 +384,28 @@ class _Session:
     # ---- the loop
 
     def replay(self, writers: Writers, interrupt: Interrupt, on_progress: Callable[[Progress], None] | None) -> Outcome:
-        """Replay, judge and write."""
+        """Replay, judge and write; RUN.toml says how it ended."""
+        self._make_folder()
+        try:
+            summary = self._written(writers, interrupt, on_progress)
+        except KeyboardInterrupt:
+            self._write_toml({"complete": False, "summary": {"interrupted": True}})
+            raise
+        self._write_toml({"complete": True, "summary": summary})
+        return Outcome(self.folder, self._file("rrd"), self.folder / "sensors.rrd", summary)
+
+    def _make_folder(self) -> None:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
             self._write_toml({"complete": False})
         except OSError as error:
             problem = f"no results can be written there ({error.strerror or error})"
             raise RecordingError(self.folder, problem, "choose another folder with -o") from error
+
+    def _written(
+        self, writers: Writers, interrupt: Interrupt, on_progress: Callable[[Progress], None] | None
+    ) -> dict[str, Any]:
+        """Replay and write the recordings and the trajectory; the summary."""
         tally, path, stopped = Tally(), _Path(), ""
         with contextlib.ExitStack() as files:
             sensors = self._sensors(writers, files)
@@ -409,8 +424,7 @@ class _Session:
             summary = self._finish(sensors, run, tally, path, interrupt.requested, stopped)
         if sensors is not None and not summary["interrupted"] and not stopped:
             _replace(self.folder / "sensors.toml", to_toml(self._sensors_values()))
-        self._write_toml({"complete": True, "summary": summary})
-        return Outcome(self.folder, self._file("rrd"), self.folder / "sensors.rrd", summary)
+        return summary | {"interrupted": interrupt.requested}
 
     def _steps(self, on_progress: Callable[[Progress], None] | None) -> Generator[Replayed]:
         total = self._expected()
@@ -634,13 +648,16 @@ def calibration(settings: Any, evaluation: Evaluation) -> dict[str, Any]:
     factors = evaluation.fitted_scale, by_length
     fit, ratio = (used * f if key == "metres_per_px" else used / f for f in factors)
     found = {"key": key, "least_squares": fit, "path_ratio": ratio}
-    sentence = f"{key} = {fit:.6g} by least squares, {ratio:.6g} by path length; use --set {key}={fit:.6g}"
+    advice = f"--set {key}={fit:.6g}"
     offsets = evaluation.errors[:, 3]
     if np.isfinite(offsets).any() and hasattr(settings, "mounting_yaw_rad"):
         found["mounting_yaw_rad"] = wrap_angle(settings.mounting_yaw_rad + mean_angle(offsets))
-        sentence += f" --set mounting_yaw_rad={found['mounting_yaw_rad']:.4f}"
-    if abs(ratio / fit - 1) > CALIBRATION_AGREES:
-        sentence += "; with care: the two do not agree, so that the path's shape is wrong, not only its scale"
+        advice += f" --set mounting_yaw_rad={found['mounting_yaw_rad']:.4f}"
+    if abs(ratio / fit - 1) <= CALIBRATION_AGREES:
+        advice = f"use {advice}"
+    else:
+        advice = "not to be used: the two do not agree, so that the path's shape is wrong, not only its scale"
+    sentence = f"{key} = {fit:.6g} by least squares, {ratio:.6g} by path length; {advice}"
     return found | {"sentence": sentence}
 
 

@@ -124,11 +124,16 @@ def _upshot(tally: Tally, doubts: bool) -> str:
     parts = [f"{percent(max(held, 0.0))} hold the last velocity"] if held > 0 else []
     parts += [f"{percent(failed)} failed a check that makes them worthless"] if tally.failed else []
     parts += [f"{percent(doubtful)} are doubtful"] if tally.doubtful else []
-    good = f"{percent(max(0.0, 1 - held - failed - doubtful))} of the motions passed every check"
+    passed = max(0, tally.used - tally.failed - tally.doubtful) / motions
+    good = f"{percent(min(passed, 1.0))} of the motions passed every check"
     sentence = ", ".join([good, *parts])
     if held + failed > 1 - TRUSTED_SHARE:
         return f"do not trust this path: {sentence}"
-    return f"{sentence}; look at what follows" if doubts else f"{sentence}; nothing in the images speaks against the method"
+    return (
+        f"{sentence}; look at what follows"
+        if doubts
+        else f"{sentence}; nothing in the images speaks against the method"
+    )
 
 
 def _grave(alarms: Verdict, severity: Severity) -> bool:
