@@ -232,12 +232,6 @@ class McapLog(BlockLog):
         elif not closed:
             self._report("the file was not closed, what is there can be read; it breaks off", offset, 0)
 
-    def _take(self, offset: int, size: int, *, torn: bool = False) -> int:
-        """Read one block, count what it holds, keep where it lies; the number of its messages."""
-        messages = self._read_block(offset, size, torn=torn)
-        self._add_block(offset, size, messages, torn=torn)
-        return len(messages)
-
     def _describe_or_report(self, offset: int, opcode: int, body: bytes) -> None:
         try:
             self._describe(opcode, memoryview(body))

@@ -201,14 +201,15 @@ class BlockLog(MessageLog):
             self._latest = (block, self._read_block(block.offset, block.size, torn=block.torn))
         return self._latest[1]
 
-    def _add_block(self, offset: int, size: int, messages: list[Message], *, torn: bool = False) -> None:
-        """Take a block, found while scanning, into the list and count its messages."""
-        if not messages:
-            return
+    def _take(self, offset: int, size: int, *, torn: bool = False) -> int:
+        """Read one block while scanning, count what it holds, keep where it lies; the number of its messages."""
+        messages = self._read_block(offset, size, torn=torn)
+        counts = Counter(message.channel for message in messages)
         for message in messages:
             message.channel.note(message.log_ns)
-        counts = Counter(message.channel for message in messages)
-        self._blocks.append(Block(offset, size, messages[0].log_ns, messages[-1].log_ns, counts, torn))
+        if messages:
+            self._blocks.append(Block(offset, size, messages[0].log_ns, messages[-1].log_ns, counts, torn))
+        return len(messages)
 
     def _find_edges(self) -> None:
         """Fill in the first and last log time of every channel, from the blocks that can hold them."""

@@ -233,11 +233,6 @@ class Ros1Log(BlockLog):
             self._size - min(offset, self._size),
         )
 
-    def _take(self, offset: int, size: int, *, torn: bool) -> int:
-        messages = self._read_block(offset, size, torn=torn)
-        self._add_block(offset, size, messages, torn=torn)
-        return len(messages)
-
     # ------------------------------------------------------------------------------ blocks
 
     def _unpack(self, raw: memoryview, torn: bool) -> tuple[list[Message], str]:

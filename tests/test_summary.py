@@ -71,6 +71,8 @@ def test_a_reference_that_disagrees_is_named_first() -> None:
         == "the reference disagrees: the end is off by 50 % of the path, whose length is 0.5 times the reference's"
     )
     assert len(suitability(tally(50), 0.016, evaluate(true, true))) == 1
+    still = Trajectory.of(t, true.pose * [1e-5, 1, 1])
+    assert suitability(tally(50), 0.016, evaluate(short, still))[1].startswith("the reference moves 0.00049 m in all")
 
 
 def test_the_list_of_causes_is_short_and_gravest_first() -> None:

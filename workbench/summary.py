@@ -16,6 +16,7 @@ TRUSTED_SHARE = 0.5
 MOST_CAUSES = 6
 SLOW_FRAMES_S = 0.5
 NOTABLE_DRIFT = 0.05
+STILL_M = 0.05
 
 ADVICE: Mapping[Verdict, str] = {
     Verdict.DUPLICATE_FRAME: "the log repeats frames; they carry no motion",
@@ -108,7 +109,12 @@ def suitability(tally: Tally, median_dt_s: float, evaluation: Evaluation | None 
 
 def _disagreement(evaluation: Evaluation | None) -> list[str]:
     """What the reference says against the path, which the images alone do not tell."""
-    if evaluation is None or not evaluation.drift > NOTABLE_DRIFT:
+    if evaluation is None:
+        return []
+    if evaluation.reference_path_m < STILL_M:
+        moved = f"the reference moves {evaluation.reference_path_m:.2g} m in all"
+        return [f"{moved}: it hardly tells anything about the path"]
+    if not evaluation.drift > NOTABLE_DRIFT:
         return []
     ratio = evaluation.path_m / evaluation.reference_path_m
     return [
