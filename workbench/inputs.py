@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import hashlib
+import itertools
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -93,8 +94,10 @@ def first_frame(recording: Recording, stream: str, start_ns: int | None, stop_ns
     """The first frame of a window.
 
     Raises:
-        StreamError: the window holds no frame, or none of the first hundred can be decoded.
+        StreamError: the window holds no frame or only one, or none of the first hundred can be decoded.
     """
+    if len(list(itertools.islice(recording.read([stream], start_ns, stop_ns), 2))) == 1:
+        raise StreamError(f"{recording.path}: {stream} has one frame in this window; a motion takes two or more")
     first_ns, tries, reason = -1, 0, ""
     for sample in recording.read([stream], start_ns, stop_ns):
         first_ns = sample.t_ns if tries == 0 else first_ns
