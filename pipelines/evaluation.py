@@ -285,7 +285,7 @@ def align(estimate: Floats, reference: Floats, *, with_scale: bool = False) -> A
     spread = float(np.sum(a**2))
     strength = math.hypot(cross, dot)
     determined = strength > 1e-12 * max(spread, float(np.sum(b**2)), 1e-300)
-    angle = math.atan2(cross, dot) if determined else _mean_angle(reference[:, 2] - estimate[:, 2])
+    angle = math.atan2(cross, dot) if determined else mean_angle(reference[:, 2] - estimate[:, 2])
     scale = strength / spread if with_scale and determined else 1.0
     c, s = math.cos(angle), math.sin(angle)
     turned = np.array([c * mean_a[0] - s * mean_a[1], s * mean_a[0] + c * mean_a[1]])
@@ -372,7 +372,7 @@ def _errors(estimate: Floats, reference: Floats) -> Floats:
     return np.column_stack([x, y, np.hypot(x, y), wrap_angles(estimate[:, 2] - reference[:, 2])])
 
 
-def _mean_angle(angles_rad: Floats) -> float:
+def mean_angle(angles_rad: Floats) -> float:
     """Circular mean of the known ones among some angles, 0 of none."""
     known = angles_rad[np.isfinite(angles_rad)]
     return math.atan2(float(np.sin(known).sum()), float(np.cos(known).sum())) if len(known) else 0.0
@@ -413,7 +413,7 @@ def _notes(raw: Floats, truth: Floats, alignment: Alignment, errors: Floats, len
     if not np.isfinite(truth[:, 2]).any():
         notes.append("the reference has no heading: the start is aligned with the rotation of the whole path")
         return tuple(notes)
-    offset = _mean_angle(errors[:, 3])
+    offset = mean_angle(errors[:, 3])
     if abs(offset) > TURNED_RAD and alignment.determined and extent >= STILL_SHARE * length:
         notes.append(
             f"after alignment the headings differ by {math.degrees(offset):.1f} degrees on average: "

@@ -8,12 +8,12 @@ from __future__ import annotations
 import heapq
 import statistics
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
 
-from readers.streams import Fact, ImageSample, Problem, Recording, Sample
+from readers.streams import CameraInfo, Fact, ImageSample, Problem, Recording, Sample, StreamKind
 
 SECOND_NS = 1_000_000_000
 DAY_NS = 86_400 * SECOND_NS
@@ -64,8 +64,8 @@ class StreamAudit:
     last_ns: int = -1
     samples: int = 0
     longest_gap_ns: int = 0
+    size_px: tuple[int, int] = (0, 0)
     _steps_ns: list[int] = field(default_factory=list)
-    _size: tuple[int, int] = (0, 0)
 
     def add(self, sample: Sample) -> None:
         """Take note of the next sample of this stream."""
@@ -90,9 +90,11 @@ class StreamAudit:
             self.counts["zero_quaternion"] += 1
         if isinstance(sample, ImageSample) and sample.width_px:
             size = (sample.width_px, sample.height_px)
-            if self._size not in ((0, 0), size):
+            if self.size_px not in ((0, 0), size):
                 self.counts["size_change"] += 1
-            self._size = size
+            self.size_px = size
+        elif isinstance(sample, CameraInfo):
+            self.size_px = (sample.camera.width_px, sample.camera.height_px)
 
     def facts(self) -> tuple[Fact, ...]:
         """The oddities met so far, each with its count and a sentence."""
@@ -121,6 +123,22 @@ class StreamAudit:
         )
 
 
+def _size_facts(recording: Recording, audits: Mapping[str, StreamAudit]) -> Iterator[Fact]:
+    """Calibrations for another size than the images have: that of their own images, else that of any."""
+    images = {info.name: audits[info.name].size_px for info in recording.of_kind(StreamKind.IMAGE)}
+    sizes = {size for size in images.values() if size != (0, 0)}
+    made_for = {info.name: audits[info.name].size_px for info in recording.of_kind(StreamKind.CAMERA)}
+    listed = [(name, size, sizes) for name, size in made_for.items()]
+    if not listed:
+        cameras = recording.cameras.items()
+        listed = [(name, (camera.width_px, camera.height_px), {images[name]} & sizes) for name, camera in cameras]
+    for name, size, against in listed:
+        if against and size != (0, 0) and size not in against:
+            found = " or ".join(f"{width} x {height} px" for width, height in sorted(against))
+            sentence = f"the calibration is for {size[0]} x {size[1]} px, the images are {found}"
+            yield Fact(stream=name, code="calibration_size", count=1, sentence=sentence)
+
+
 def survey(recording: Recording, progress: Callable[[int, int], None] | None = None) -> tuple[Fact, ...]:
     """Read every readable stream once, without decoding images, and count what is odd.
 
@@ -140,6 +158,7 @@ def survey(recording: Recording, progress: Callable[[int, int], None] | None = N
     if progress is not None:
         progress(done, done)
     facts = [fact for info in readable for fact in audits[info.name].facts()]
+    facts += _size_facts(recording, audits)
     for info in readable:
         missing = info.count - audits[info.name].samples
         if info.count >= 0 and missing:

@@ -352,6 +352,17 @@ class LogRecording(Recording):
             if (start_ns is None or sample.t_ns >= start_ns) and (stop_ns is None or sample.t_ns < stop_ns):
                 yield sample
 
+    def count_before(self, stream: str, t_ns: int) -> int:
+        """See `Recording.count_before`; by the index up to shortly before `t_ns`."""
+        self._wanted([stream])
+        topic = next(t for t in self._topics if any(info.name == stream for info in t.streams))
+        if topic.pairs:
+            return super().count_before(stream, t_ns)
+        lower, upper = t_ns + topic.lag_ns - SLACK_NS, t_ns + topic.lag_ns + SLACK_NS
+        before = sum(log.count_before([c for c in log.channels if c in topic.channels], lower) for log in self._logs)
+        near = self._messages(topic.channels, lower, upper)
+        return before + sum(sample.t_ns < t_ns for message in near for sample in topic.samples(message))
+
     def close(self) -> None:
         """Release the files and temporary copies."""
         for log in self._logs:

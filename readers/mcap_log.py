@@ -27,6 +27,8 @@ RUN_BYTES = 1 << 20
 _HEAD = struct.Struct("<BQ")
 _MESSAGE = struct.Struct("<HIQQ")
 _CHUNK = struct.Struct("<QQQII")
+_INDEX_HEAD = struct.Struct("<BQHI")
+_INDEX_ENTRY_BYTES = 16
 _FOOTER = struct.Struct("<BQQQI8s")
 _DEFAULT_ENCODING = {"ros1": "ros1", "ros2": "cdr"}
 _PARSE_ERRORS = (McapError, struct.error, ValueError, KeyError, OverflowError, MemoryError)
@@ -136,14 +138,17 @@ class McapLog(BlockLog):
         for index in indexes:
             if not index.message_index_offsets or not set(index.message_index_offsets) <= set(self._by_id):
                 return False
-            channels = frozenset(self._by_id[number] for number in index.message_index_offsets)
+            counts = {
+                self._by_id[number]: self._indexed_count(offset, number)
+                for number, offset in index.message_index_offsets.items()
+            }
             self._blocks.append(
                 Block(
                     index.chunk_start_offset,
                     index.chunk_length,
                     index.message_start_time,
                     index.message_end_time,
-                    channels,
+                    counts,
                 )
             )
         if not set(statistics.channel_message_counts) <= set(self._by_id):
@@ -151,6 +156,13 @@ class McapLog(BlockLog):
         for number, count in statistics.channel_message_counts.items():
             self._by_id[number].count = count
         return True
+
+    def _indexed_count(self, offset: int, number: int) -> int:
+        """How many messages of a channel the message index at `offset` lists."""
+        opcode, _, channel, size = _INDEX_HEAD.unpack(self._bytes(offset, _INDEX_HEAD.size))
+        if opcode != Opcode.MESSAGE_INDEX or channel != number:
+            raise ValueError
+        return int(size) // _INDEX_ENTRY_BYTES
 
     def _describe(self, opcode: int, body: memoryview) -> None:
         """Take a schema or a channel; other records are passed over."""
@@ -219,12 +231,6 @@ class McapLog(BlockLog):
             self._report(f"{fault}, though every message can be read; the damage begins", offset, 0)
         elif not closed:
             self._report("the file was not closed, what is there can be read; it breaks off", offset, 0)
-
-    def _take(self, offset: int, size: int, *, torn: bool = False) -> int:
-        """Read one block, count what it holds, keep where it lies; the number of its messages."""
-        messages = self._read_block(offset, size, torn=torn)
-        self._add_block(offset, size, messages, torn=torn)
-        return len(messages)
 
     def _describe_or_report(self, offset: int, opcode: int, body: bytes) -> None:
         try:

@@ -9,7 +9,8 @@ from __future__ import annotations
 import abc
 import bz2
 import heapq
-from collections.abc import Collection, Iterable, Iterator
+from collections import Counter
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -124,6 +125,10 @@ class MessageLog(abc.ABC):
     ) -> Iterable[Source]:
         """Where the messages of `channels` with ``start_ns <= log time < stop_ns`` can be read."""
 
+    def count_before(self, channels: Collection[Channel], stop_ns: int) -> int:
+        """How many messages of `channels` were logged before `stop_ns`."""
+        return sum(1 for source in self.sources(channels, None, stop_ns) for _ in source.open())
+
     @abc.abstractmethod
     def close(self) -> None:
         """Release the file."""
@@ -133,15 +138,21 @@ class MessageLog(abc.ABC):
 class Block:
     """A stretch of a file that is read at once: a chunk, or a run of messages outside of chunks.
 
-    `torn` marks a block that the end of the file cuts: what it holds up to there is read.
+    `counts` says how many messages of each channel it holds. `torn` marks a block that the end of the file cuts:
+    what it holds up to there is read.
     """
 
     offset: int
     size: int
     first_ns: int
     last_ns: int
-    channels: frozenset[Channel]
+    counts: Mapping[Channel, int]
     torn: bool = False
+
+    @property
+    def channels(self) -> frozenset[Channel]:
+        """The channels of which the block holds messages."""
+        return frozenset(self.counts)
 
 
 class BlockLog(MessageLog):
@@ -190,14 +201,15 @@ class BlockLog(MessageLog):
             self._latest = (block, self._read_block(block.offset, block.size, torn=block.torn))
         return self._latest[1]
 
-    def _add_block(self, offset: int, size: int, messages: list[Message], *, torn: bool = False) -> None:
-        """Take a block, found while scanning, into the list and count its messages."""
-        if not messages:
-            return
+    def _take(self, offset: int, size: int, *, torn: bool = False) -> int:
+        """Read one block while scanning, count what it holds, keep where it lies; the number of its messages."""
+        messages = self._read_block(offset, size, torn=torn)
+        counts = Counter(message.channel for message in messages)
         for message in messages:
             message.channel.note(message.log_ns)
-        channels = frozenset(message.channel for message in messages)
-        self._blocks.append(Block(offset, size, messages[0].log_ns, messages[-1].log_ns, channels, torn))
+        if messages:
+            self._blocks.append(Block(offset, size, messages[0].log_ns, messages[-1].log_ns, counts, torn))
+        return len(messages)
 
     def _find_edges(self) -> None:
         """Fill in the first and last log time of every channel, from the blocks that can hold them."""
@@ -237,6 +249,21 @@ class BlockLog(MessageLog):
                 continue
             if wanted & block.channels:
                 yield Source(block.first_ns, partial(self._select, block, wanted, start_ns, stop_ns))
+
+    def count_before(self, channels: Collection[Channel], stop_ns: int) -> int:
+        """How many messages of `channels` were logged before `stop_ns`, by the index for all but the last blocks.
+
+        The messages of a damaged block that has an index are counted, so that the later ones keep their numbers.
+        """
+        wanted, total = frozenset(channels), 0
+        for block in self._blocks:
+            if block.first_ns >= stop_ns or not wanted & block.channels:
+                continue
+            if block.last_ns < stop_ns:
+                total += sum(block.counts.get(channel, 0) for channel in wanted)
+            else:
+                total += sum(1 for _ in self._select(block, wanted, None, stop_ns))
+        return total
 
     def close(self) -> None:
         """Release the file."""

@@ -18,6 +18,7 @@ import numpy as np
 
 from readers.clock import sane_stamp
 from readers.decoding import MessageError
+from readers.images import image_header
 from readers.streams import (
     UNKNOWN_COV3,
     UNKNOWN_COV6,
@@ -37,15 +38,6 @@ from readers.streams import (
     StreamKind,
     array,
 )
-
-SIGNATURES = {
-    b"\xff\xd8\xff": "jpeg",
-    b"\x89PNG\r\n\x1a\n": "png",
-    b"II*\0": "tiff",
-    b"MM\0*": "tiff",
-    b"BM": "bmp",
-    b"\0\0\0\x0cjP": "jp2",
-}
 
 
 class UnsupportedError(MessageError):
@@ -192,25 +184,22 @@ def compressed_image(message: Any, arrival: Arrival) -> ImageSample:
     payload = _bytes(message.data)
     if not payload:
         raise MessageError("the image holds no bytes")
+    encoding, width, height = image_header(payload)
     return ImageSample(
         **arrival.stamps(header_stamp(message)),
-        encoding=compressed_format(payload, message.format),
+        encoding=encoding or stated_format(message.format),
         payload=payload,
+        width_px=width,
+        height_px=height,
         source=arrival.source,
     )
 
 
-def compressed_format(payload: bytes | memoryview, stated: str) -> str:
-    """Name of a compressed format, by the first bytes where they are known, else by what the message states.
+def stated_format(stated: str) -> str:
+    """Name of the compressed format that a message states.
 
     ROS states ``jpeg``, ``png``, or a sentence such as ``rgb8; jpeg compressed bgr8``.
     """
-    start = bytes(payload[:12])
-    for signature, name in SIGNATURES.items():
-        if start.startswith(signature):
-            return name
-    if start[:4] == b"RIFF" and start[8:12] == b"WEBP":
-        return "webp"
     sentence = stated.rpartition(";")[2].split()
     name = sentence[0].lower() if sentence else "unknown"
     return {"jpg": "jpeg", "tif": "tiff"}.get(name, name)

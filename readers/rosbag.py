@@ -184,7 +184,7 @@ class Ros1Log(BlockLog):
                 channel.count += count
             if counts:
                 first, last = _time_ns(fields[b"start_time"]), _time_ns(fields[b"end_time"])
-                self._blocks.append(Block(place, following - place, first, last, frozenset(counts)))
+                self._blocks.append(Block(place, following - place, first, last, counts))
 
     def _connect(self, fields: Fields, body: memoryview) -> None:
         """Take a connection record as a channel."""
@@ -232,11 +232,6 @@ class Ros1Log(BlockLog):
             offset,
             self._size - min(offset, self._size),
         )
-
-    def _take(self, offset: int, size: int, *, torn: bool) -> int:
-        messages = self._read_block(offset, size, torn=torn)
-        self._add_block(offset, size, messages, torn=torn)
-        return len(messages)
 
     # ------------------------------------------------------------------------------ blocks
 
@@ -362,6 +357,22 @@ class SqliteLog(MessageLog):
         if start_ns < stop_ns:
             rows = self._saved_rows if self._rows is not None else self._sound_rows
             yield Source(start_ns, partial(self._messages, rows(numbers, start_ns, stop_ns)))
+
+    def count_before(self, channels: Collection[Channel], stop_ns: int) -> int:
+        """How many messages of `channels` were logged before `stop_ns`."""
+        numbers = [number for number, channel in self._by_id.items() if channel in channels]
+        if self._rows is not None:
+            return sum(1 for log_ns, _, number in self._rows if log_ns < stop_ns and number in numbers)
+        marks = ", ".join("?" * len(numbers))
+        query = (
+            "SELECT count(*) FROM messages WHERE timestamp < ?"
+            f" AND typeof(timestamp) = 'integer' AND topic_id IN ({marks})"
+        )
+        try:
+            count: int = self._database.execute(query, (stop_ns, *numbers)).fetchone()[0]
+        except sqlite3.DatabaseError:
+            return super().count_before(channels, stop_ns)
+        return count
 
     def _messages(self, rows: Iterator[tuple[int, int, Any]]) -> Iterator[Message]:
         for number, log_ns, data in rows:

@@ -116,6 +116,11 @@ class VideoRecording(Recording):
         stop = None if stop_ns is None else self._index_from(stop_ns)
         return self._frames(first, stop)
 
+    def count_before(self, stream: str, t_ns: int) -> int:
+        """See `Recording.count_before`; by the frame rate."""
+        self.stream(stream)
+        return min(self._index_from(t_ns), self._count)
+
     def _frames(self, first: int, stop: int | None) -> Iterator[Sample]:
         if stop is not None and stop <= first:
             return

@@ -21,7 +21,7 @@ import workbench.session
 import workbench.settings
 from readers.streams import Fact, StreamKind, WorkbenchError
 from tests import toy_session
-from tests.toy_session import START, TextLog, ToyMission
+from tests.toy_session import START, TextLog, ToyMission, ToyRun
 from tests.toys import image
 from workbench.cli import files_of, main, moment, shown, table, view_command
 from workbench.inputs import digest, parse_time
@@ -136,7 +136,7 @@ def test_json_is_one_object_on_stdout(toys: Path, shell: Shell) -> None:
 
 
 def test_numbers_that_are_unknown_are_null_in_json(toys: Path, shell: Shell) -> None:
-    said = shell.replay("walk-camera.log", "--json", "--to", "0.05")
+    said = shell.replay("walk-camera.log", "--json", "--stride", "100")
     assert said.json["median_dt_s"] is None
     assert "not compared: 1 of 1 poses" in said.json["reference"]
 
@@ -324,18 +324,19 @@ def test_a_calibration_for_another_size_is_not_used(toys: Path, shell: Shell, mo
 def test_the_scale_is_calibrated_against_the_reference(
     toys: Path, shell: Shell, words: list[str], key: str, value: float
 ) -> None:
-    got = shell.replay("walk.log", "--json", "--calibrate-scale", *words).json["calibration"]
+    got = shell.replay("walk.log", "--json", "--calibrate", *words).json["calibration"]
     assert got["key"] == key
     assert got["least_squares"] == pytest.approx(value)
     assert got["path_ratio"] == pytest.approx(value)
-    assert f"--set {key}={value:g}" in shell.replay("walk.log", "--calibrate-scale", *words).out
+    assert f"--set {key}={value:g}" in shell.replay("walk.log", "--calibrate", *words).out
 
 
 def test_a_calibration_without_reference_is_refused(toys: Path, shell: Shell) -> None:
-    assert "needs a reference" in shell.replay("walk.log", "--calibrate-scale", "--reference", "none").error
-    said = shell.replay("walk.log", "--calibrate-scale", "--to", "0.05")
+    assert "needs a reference" in shell.replay("walk.log", "--calibrate", "--reference", "none").error
+    said = shell.replay("walk.log", "--calibrate", "--reference-offset", "3")
     assert said.status == 2
     assert "cannot be compared" in said.err
+    assert tomllib.loads(Path("results/walk/best.toml").read_text())["complete"]
 
 
 # --------------------------------------------------------------------------------- damage
@@ -388,6 +389,7 @@ def test_damaged_images_are_verdicts_events_and_facts(
         (["replay", "walk.log", "-e", "toy", "--from", "soon"], "'soon' is not a time"),
         (["replay", "walk.log", "-e", "toy", "--from", "2", "--to", "1"], "--to 1 does not lie after --from 2"),
         (["replay", "walk.log", "-e", "toy", "--from", "900"], "has no frame in this window"),
+        (["replay", "walk.log", "-e", "toy", "--to", "0.05"], "has one frame in this window"),
         (["replay", "walk.log", "-e", "toy", "--times-unit", "min"], "must be one of auto, s, ms, us, ns"),
         (["replay", "walk.log", "-e", "toy", "--rate", "0"], "--rate 0"),
         (["replay", "walk.log", "-e", "toy", "--tf", "map"], "write two frames with a comma"),
@@ -481,6 +483,33 @@ def test_an_interrupt_ends_with_status_130_and_whole_files(tmp_path: Path, numbe
     assert not (folder / "sensors.toml").exists()
 
 
+def test_a_second_interrupt_ends_at_once_and_is_noted(
+    toys: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def interrupted(self: ToyRun, *_: Any) -> None:
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(ToyRun, "finish", interrupted)
+    assert shell.replay("walk.log").status == 130
+    state = tomllib.loads(Path("results/walk/best.toml").read_text())
+    assert (state["complete"], state["interrupted"]) == (False, True)
+    assert len(Path("results/walk/best.tum").read_text().splitlines()) == 40
+
+
+def test_a_reference_of_another_time_is_refused_where_it_was_asked_for(toys: Path, shell: Shell) -> None:
+    words = ["--reference-offset", "1000"]
+    assert "at another time than the images" in shell.replay("walk.log", "--reference", "/truth", *words).error
+    assert not Path("results").exists()
+    summary = shell.replay("walk.log", "--json", *words).json
+    assert summary["reference"].startswith("none: /truth lies from")
+
+
+def test_a_folder_that_cannot_be_made_is_named(toys: Path, shell: Shell) -> None:
+    Path("full.txt").touch()
+    said = shell.replay("walk.log", "-o", "full.txt/deeper")
+    assert "full.txt/deeper: no results can be written there" in said.error
+
+
 def test_status_and_streams_of_the_real_command(tmp_path: Path) -> None:
     (tmp_path / "walk.log").touch()
     good = start(tmp_path, "replay", "walk.log", "-e", "toy", "--json")
@@ -501,7 +530,7 @@ def test_help_imports_nothing_heavy() -> None:
     )
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "[]"
-    assert "--calibrate-scale" in done.stdout
+    assert "--calibrate" in done.stdout
 
 
 @pytest.mark.parametrize("command", [[], ["inspect"], ["replay"], ["view"], ["demo"], ["settings"]])

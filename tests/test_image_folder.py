@@ -759,68 +759,6 @@ def test_a_file_is_no_folder(tmp_path: Path) -> None:
 
 # ------------------------------------------------------------------------ shared recordings
 
-OPENED = [
-    ("drone_nadir_caliterra_a", None, {"gps": 42, "images": 42}, "image folder with a GNSS table"),
-    ("drone_nadir_caliterra_a/images", None, {"gps": 42, "images": 42}, "image folder"),
-    ("drone_nadir_caliterra_a/full_size", None, {"gps": 2, "images": 2}, "image folder"),
-    ("drone_nadir_seneca_size_change", None, {"gps": 6, "images": 6}, "image folder with a GNSS table"),
-    ("kitti_06_first51", None, {"image_0": 51, "poses": 51}, "KITTI odometry folder"),
-    (
-        "euroc_v1_01_standstill_a",
-        None,
-        {"cam0": 25, "groundtruth_200hz_tum": 53, "imu0": 261, "state_groundtruth_estimate0": 27},
-        "EuRoC ASL folder",
-    ),
-    ("stereo_chessboard", 10, {"left": 13, "right": 13}, "image folder"),
-    ("rgbd_5_frames", 10, {"color": 5, "depth": 5, "pose": 5}, "image folder"),
-    ("tum_fr3_office_4_frames", None, {"rgb": 4}, "TUM RGB-D folder"),
-    ("ground_textures", 1, {"images": 3}, "image folder"),
-    ("paper_a_surface_frames", 1, {"images": 11}, "image folder"),
-    (
-        "_no_licence_stated/downward_checker_60fps_a",
-        None,
-        {"images": 869, "mocap": 7315},
-        "image folder with a motion-capture table",
-    ),
-]
-REFUSED = [
-    ("stereo_chessboard", "--rate HZ"),
-    ("rgbd_5_frames", "--rate HZ"),
-    ("ground_textures", "--rate HZ"),
-    ("paper_a_surface_frames", "--rate HZ"),
-    ("_no_licence_stated/mrclam1_robot1", "no images: its .dat or .mat tables"),
-    ("_no_licence_stated/starry_night_stereo_landmarks", "no images: its .dat or .mat tables"),
-]
-
-
-@pytest.mark.parametrize(("folder", "rate", "counts", "form"), OPENED, ids=[row[0] for row in OPENED])
-def test_shared_folder_opens(folder: str, rate: float | None, counts: dict[str, int], form: str) -> None:
-    with open_folder(RECORDINGS / folder, ReadOptions(rate_hz=rate)) as recording:
-        assert recording.format == form
-        assert {s.name: s.count for s in recording.streams} == counts
-        assert recording.damage == ()
-        read = dict.fromkeys(counts, 0)
-        last = 0
-        for sample in recording.read():
-            assert not isinstance(sample, Problem)
-            assert sample.t_ns >= last
-            last = sample.t_ns
-            read[sample.stream] += 1
-        assert read == counts
-        for info in recording.of_kind(StreamKind.IMAGE):
-            first = next(iter(recording.read([info.name])))
-            assert isinstance(first, ImageSample)
-            assert first.grey().ndim == 2
-            assert first.width_px in (0, first.grey().shape[1])
-
-
-@pytest.mark.parametrize(("folder", "words"), REFUSED, ids=[row[0] for row in REFUSED])
-def test_shared_folder_is_refused(folder: str, words: str) -> None:
-    with pytest.raises(RecordingError) as caught:
-        open_folder(RECORDINGS / folder)
-    assert words in str(caught.value)
-    assert "\n" not in str(caught.value)
-
 
 def test_shared_oddities_have_their_answers() -> None:
     seneca = StreamAudit("images")

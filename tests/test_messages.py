@@ -4,12 +4,13 @@ import math
 from types import SimpleNamespace
 from typing import Any
 
+import cv2
 import numpy as np
 import pytest
 from made_logs import MS, ROS1, ROS2, START_NS, Maker
 
 from readers.decoding import MessageError
-from readers.messages import READERS, Arrival, UnsupportedError, compressed_format, reader_of, samples_of, stamp_ns
+from readers.messages import READERS, Arrival, UnsupportedError, reader_of, samples_of, stamp_ns
 from readers.streams import StreamKind
 
 LOG_NS = START_NS + 7 * MS
@@ -193,7 +194,15 @@ def test_an_image_with_too_few_bytes_is_an_error(change: dict[str, Any]) -> None
     ],
 )
 def test_compressed_formats(start: bytes, stated: str, result: str) -> None:
-    assert compressed_format(start + bytes(8), stated) == result
+    message = SimpleNamespace(header=make.header(START_NS), format=stated, data=np.frombuffer(start + bytes(8), "u1"))
+    assert read("sensor_msgs/CompressedImage", message).encoding == result
+
+
+def test_compressed_images_tell_their_size() -> None:
+    data = cv2.imencode(".jpg", np.zeros((30, 40), np.uint8))[1].reshape(-1)
+    message = SimpleNamespace(header=make.header(START_NS), format="jpeg", data=data)
+    found = read("sensor_msgs/CompressedImage", message)
+    assert (found.width_px, found.height_px) == (40, 30)
 
 
 def test_compressed_depth_is_refused_by_name() -> None:

@@ -11,6 +11,7 @@ import json
 import os
 import subprocess
 import sys
+import threading
 import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -29,6 +30,9 @@ EPOCH_NS = 100_000_000_000_000_000
 WIDEST = 60
 BAR_SECONDS = 0.1
 LINE_SECONDS = 5.0
+PATIENCE_SECONDS = 2.0
+
+FIRST_START = "the first start compiles the estimator, which takes up to a minute; later ones do not"
 
 app = typer.Typer(
     name="workbench",
@@ -43,7 +47,14 @@ app = typer.Typer(
     add_completion=False,
     rich_markup_mode=None,
     pretty_exceptions_enable=False,
+    context_settings={"max_content_width": 100},
 )
+
+
+def _examples(*lines: str) -> str:
+    """Examples below a command's help, line by line as they stand."""
+    return "\n  ".join(("\b\nExamples:", *lines))
+
 
 RecordingPath = Annotated[
     Path, typer.Argument(metavar="PATH", help="ROS 1 bag, ROS 2 bag, MCAP, image folder or video", show_default=False)
@@ -70,7 +81,14 @@ def _common(
 # -------------------------------------------------------------------------------- inspect
 
 
-@app.command(short_help="What is in a recording, and what is odd about it.")
+@app.command(
+    short_help="What is in a recording, and what is odd about it.",
+    epilog=_examples(
+        "workbench inspect mission.bag",
+        "workbench inspect frames/ --rate 30",
+        "workbench inspect mission.mcap --json | jq '.streams[].name'",
+    ),
+)
 def inspect(
     path: RecordingPath,
     as_json: AsJson = False,
@@ -80,14 +98,7 @@ def inspect(
     times_unit: TimesUnit = "auto",
     tf: TimeFrames = None,
 ) -> None:
-    r"""Show what is in a recording: streams, cameras, damage, and what is odd about its clocks.
-
-    \b
-    Examples:
-      workbench inspect mission.bag
-      workbench inspect frames/ --rate 30
-      workbench inspect mission.mcap --json | jq '.streams[].name'
-    """
+    """Show what is in a recording: streams, cameras, damage, and what is odd about its clocks."""
     from workbench.session import open_any
 
     with open_any(path, _options(rate, times, times_unit, tf)) as recording:
@@ -194,7 +205,17 @@ def _camera_text(camera: Camera) -> str:
 # --------------------------------------------------------------------------------- replay
 
 
-@app.command(short_help="Replay a recording; write all that was computed.")
+@app.command(
+    short_help="Replay a recording; write all that was computed.",
+    epilog=_examples(
+        "workbench replay mission.bag",
+        "workbench replay mission.bag --preset paper-a --from 10 --to 20",
+        "workbench replay mission.bag --set search_radius_px=16 --name wide",
+        "workbench replay mission.bag --set metres_per_px=0.00078",
+        "workbench replay mission.bag --height /lidar/range --reference /mocap/pose",
+        "workbench replay frames/ --rate 60 --times times.txt --json",
+    ),
+)
 def replay(
     path: RecordingPath,
     estimator: Annotated[str, typer.Option("--estimator", "-e", help="Name of the estimator.")] = "correlation",
@@ -225,8 +246,8 @@ def replay(
     height: Annotated[
         str | None, typer.Option(metavar="TOPIC", help="Range, number or pose (z) stream of the camera's height.")
     ] = None,
-    calibrate_scale: Annotated[
-        bool, typer.Option("--calibrate-scale", help="Tell the scale that fits the reference best.")
+    calibrate: Annotated[
+        bool, typer.Option("--calibrate", help="Tell the scale and mounting yaw that fit the reference.")
     ] = False,
     raw_images: Annotated[str, typer.Option(metavar="FORM", help="Keep raw images as png or raw.")] = "png",
     rate: Rate = None,
@@ -235,19 +256,10 @@ def replay(
     tf: TimeFrames = None,
     as_json: AsJson = False,
 ) -> None:
-    r"""Replay a recording through an estimator; write all it computed, and a summary.
+    """Replay a recording through an estimator; write all it computed, and a summary.
 
     The folder of the results then holds sensors.rrd, RUN.rrd, RUN.toml (settings, versions, summary) and RUN.tum
     (trajectory). Ctrl-C ends the replay early and loses nothing.
-
-    \b
-    Examples:
-      workbench replay mission.bag
-      workbench replay mission.bag --preset paper-a --from 10 --to 20
-      workbench replay mission.bag --set search_radius_px=16 --name wide
-      workbench replay mission.bag --set metres_per_px=0.00078
-      workbench replay mission.bag --height /lidar/range --reference /mocap/pose
-      workbench replay frames/ --rate 60 --times times.txt --json
     """
     from workbench.session import Request
 
@@ -267,7 +279,7 @@ def replay(
         reference_offset_s=reference_offset,
         height=height,
         options=_options(rate, times, times_unit, tf),
-        calibrate_scale=calibrate_scale,
+        calibrate=calibrate,
         raw_images=_one_of(raw_images, ("png", "raw"), "--raw-images"),
     )
     outcome = _replay(request)
@@ -295,7 +307,7 @@ def _status(outcome: Outcome) -> int:
         return IN_PART
     calibration = summary["calibration"]
     if calibration is not None and not calibration["key"]:
-        _error(f"--calibrate-scale: {calibration['sentence']}")
+        _error(f"--calibrate: {calibration['sentence']}")
         return REFUSED
     return 0
 
@@ -321,22 +333,23 @@ def _print_summary(outcome: Outcome) -> None:
 # ----------------------------------------------------------------------------------- view
 
 
-@app.command(short_help="Look at one or several runs in the Rerun viewer.")
+@app.command(
+    short_help="Look at one or several runs in the Rerun viewer.",
+    epilog=_examples(
+        "workbench view results/mission",
+        "workbench view results/mission/best.rrd results/mission/paper-a.rrd",
+        "workbench view results/mission --web",
+    ),
+)
 def view(
     runs: Annotated[
         list[Path], typer.Argument(metavar="RUN...", help="RUN.rrd files, or folders of results", show_default=False)
     ],
     web: Annotated[bool, typer.Option("--web", help="Show it in the browser, served on this machine only.")] = False,
 ) -> None:
-    r"""Open the Rerun viewer with one or several runs and the images that belong to them.
+    """Open the Rerun viewer with one or several runs and the images that belong to them.
 
     Without a display the command that would open it is printed.
-
-    \b
-    Examples:
-      workbench view results/mission
-      workbench view results/mission/best.rrd results/mission/paper-a.rrd
-      workbench view results/mission --web
     """
     command = view_command(files_of(runs), web=web)
     if not web and not _has_display():
@@ -386,19 +399,19 @@ def _has_display() -> bool:
 # ----------------------------------------------------------------------------------- demo
 
 
-@app.command(short_help="Replay the built-in recording.")
+@app.command(
+    short_help="Replay the built-in recording.",
+    epilog=_examples(
+        "workbench demo && workbench view results/demo",
+    ),
+)
 def demo(
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of the results.")] = Path(
         "results/demo"
     ),
     as_json: AsJson = False,
 ) -> None:
-    r"""Replay the built-in recording with both presets and say how to look at the result.
-
-    \b
-    Example:
-      workbench demo && workbench view results/demo
-    """
+    """Replay the built-in recording with both presets and say how to look at the result."""
     from workbench.session import Request
 
     path = demo_recording()
@@ -436,18 +449,18 @@ def demo_recording() -> Path:
 # ------------------------------------------------------------------------------- settings
 
 
-@app.command(short_help="Print the settings of a preset as a settings file.")
+@app.command(
+    short_help="Print the settings of a preset as a settings file.",
+    epilog=_examples(
+        "workbench settings --preset paper-a > mine.toml",
+        "workbench replay mission.bag --settings mine.toml",
+    ),
+)
 def settings(
     estimator: Annotated[str, typer.Option("--estimator", "-e", help="Name of the estimator.")] = "correlation",
     preset: Annotated[str | None, typer.Option(help="Preset of its settings.")] = None,
 ) -> None:
-    r"""Print the settings of a preset as a settings file, each with what it is.
-
-    \b
-    Example:
-      workbench settings --preset paper-a > mine.toml
-      workbench replay mission.bag --settings mine.toml
-    """
+    """Print the settings of a preset as a settings file, each with what it is."""
     from workbench.settings import described, plugin, settings_values, to_toml
 
     chosen = plugin(estimator)
@@ -538,18 +551,23 @@ class _Bar:
         self._task: Any = None
         self._told = time.monotonic()
         self._began = self._told
+        self._patience = threading.Timer(PATIENCE_SECONDS, self._console, ["no frame yet: " + FIRST_START])
+        self._patience.daemon = True
 
     def __enter__(self) -> Self:
+        self._patience.start()
         return self
 
     def __exit__(
         self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
     ) -> None:
+        self._patience.cancel()
         if self._live is not None:
             self._live.stop()
 
     def __call__(self, progress: Progress) -> None:
         """Take note of a frame; show it if the last time is long enough ago."""
+        self._patience.cancel()
         now = time.monotonic()
         terminal = sys.stderr.isatty()
         if now - self._told < (BAR_SECONDS if terminal else LINE_SECONDS) and progress.done != progress.total:
@@ -560,7 +578,10 @@ class _Bar:
         else:
             of = "" if progress.total is None else f" of {progress.total}"
             speed = progress.done / max(now - self._began, 1e-9)
-            print(f"{self._title}: frame {progress.done}{of}, {speed:.0f} frames/s", file=sys.stderr, flush=True)
+            self._console(f"frame {progress.done}{of}, {speed:.0f} frames/s")
+
+    def _console(self, text: str) -> None:
+        print(f"{self._title}: {text}", file=sys.stderr, flush=True)
 
     def _draw(self, progress: Progress) -> None:
         if self._live is None:

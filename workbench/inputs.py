@@ -8,6 +8,7 @@ from __future__ import annotations
 import contextlib
 import datetime
 import hashlib
+import itertools
 import math
 import re
 from collections.abc import Iterable, Iterator, Sequence
@@ -93,8 +94,10 @@ def first_frame(recording: Recording, stream: str, start_ns: int | None, stop_ns
     """The first frame of a window.
 
     Raises:
-        StreamError: the window holds no frame, or none of the first hundred can be decoded.
+        StreamError: the window holds no frame or only one, or none of the first hundred can be decoded.
     """
+    if len(list(itertools.islice(recording.read([stream], start_ns, stop_ns), 2))) == 1:
+        raise StreamError(f"{recording.path}: {stream} has one frame in this window; a motion takes two or more")
     first_ns, tries, reason = -1, 0, ""
     for sample in recording.read([stream], start_ns, stop_ns):
         first_ns = sample.t_ns if tries == 0 else first_ns
@@ -228,9 +231,38 @@ def load_reference(
     lower = None if start_ns is None else start_ns + offset_ns - MARGIN_NS
     upper = None if stop_ns is None else stop_ns + offset_ns + MARGIN_NS
     poses = reference_poses(_while_readable(recording.read([stream], lower, upper)))
-    if not poses:
-        return Reference("", f"none: {stream} holds no position in this window")
-    return Reference(stream, sentence, poses)
+    if poses:
+        return Reference(stream, sentence, poses)
+    return _no_reference(recording, f"{stream} holds no position in this window", wanted)
+
+
+def overlapping(
+    recording: Recording, reference: Reference, wanted: str | None, image: str, first_ns: int, offset_ns: int
+) -> Reference:
+    """The same reference, or none if all of it lies before the first image or after the last one.
+
+    Raises:
+        StreamError: it was asked for by name.
+    """
+    if not reference.poses:
+        return reference
+    images = recording.stream(image)
+    last_ns = images.last_ns + max(0, first_ns - images.first_ns)
+    begin, end = reference.poses[0].t_ns - offset_ns, reference.poses[-1].t_ns - offset_ns
+    if end >= first_ns and (images.last_ns < 0 or begin <= last_ns + MARGIN_NS):
+        return reference
+    problem = (
+        f"{reference.stream} lies from {begin / 1e9:.3f} to {end / 1e9:.3f} s, at another time than the images, which "
+        f"begin at {first_ns / 1e9:.3f} s; look at --reference-offset"
+    )
+    return _no_reference(recording, problem, wanted)
+
+
+def _no_reference(recording: Recording, problem: str, wanted: str | None) -> Reference:
+    """No reference where it was only supposed, an error where it was asked for."""
+    if wanted is not None:
+        raise StreamError(f"{recording.path}: {problem}; choose another with --reference, or none")
+    return Reference("", f"none: {problem}")
 
 
 def _while_readable(samples: Iterator[Sample]) -> Iterator[Sample]:

@@ -19,6 +19,7 @@ import tomllib
 from array import array
 from collections.abc import Callable, Generator, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from types import FrameType
 from typing import Any, NamedTuple, Protocol, Self, TextIO
@@ -26,8 +27,8 @@ from typing import Any, NamedTuple, Protocol, Self, TextIO
 import numpy as np
 
 from pipelines.estimator import Estimator, Step
-from pipelines.evaluation import Evaluation, EvaluationError, Trajectory, evaluate, path_lengths
-from pipelines.geometry import Floats
+from pipelines.evaluation import Evaluation, EvaluationError, Trajectory, evaluate, mean_angle, path_lengths
+from pipelines.geometry import Floats, wrap_angle
 from pipelines.replay import Replayed, replay
 from pipelines.verdict import Severity
 from readers.clock import StreamAudit
@@ -79,7 +80,7 @@ class Request:
     reference_offset_s: float = 0.0
     height: str | None = None
     options: ReadOptions = field(default_factory=ReadOptions)
-    calibrate_scale: bool = False
+    calibrate: bool = False
     raw_images: str = "png"
 
 
@@ -126,17 +127,29 @@ class RunLog(Protocol):
 
 
 class Writers(NamedTuple):
-    """The classes that write the two kinds of files."""
+    """What makes the writers of the two kinds of files.
+
+    Both are called with the file and, by name, the `recording_id`, the `run`, the name of its `estimator` and its
+    `step_type`; `sensors` with `raw_images` as well, `run` with `settings_text` and the positions of the reference,
+    `reference_xy` [n, 2] in m (none where the path is not in metres).
+    """
 
     sensors: Callable[..., SensorLog]
     run: Callable[..., RunLog]
 
 
 def rerun_writers() -> Writers:
-    """The writers of Rerun recordings."""
+    """The writers of Rerun recordings; both files bring the view of the run along, whichever is opened last."""
+    from workbench.blueprints import Extent, blueprint_of
     from workbench.rrd import RunWriter, SensorWriter
 
-    return Writers(SensorWriter, RunWriter)
+    def sensors(file: Path, *, run: str, estimator: str, step_type: type[Step], **options: Any) -> SensorLog:
+        return SensorWriter(file, view=partial(blueprint_of, step_type, run, estimator), **options)
+
+    def run(file: Path, *, reference_xy: Floats, **options: Any) -> RunLog:
+        return RunWriter(file, extent=Extent.of(reference_xy) if len(reference_xy) else None, **options)
+
+    return Writers(sensors, run)
 
 
 # ------------------------------------------------------------------------------ interrupt
@@ -251,8 +264,9 @@ def _prepare(
     first = inputs.first_frame(recording, image, start_ns, stop_ns)
     offset_ns = round(request.reference_offset_s * 1e9)
     reference = inputs.load_reference(recording, request.reference, start_ns, stop_ns, offset_ns)
-    if request.calibrate_scale and not reference.poses:
-        raise StreamError(f"{request.path}: --calibrate-scale needs a reference, but there is {reference.sentence}")
+    reference = inputs.overlapping(recording, reference, request.reference, image, first.t_ns, offset_ns)
+    if request.calibrate and not reference.poses:
+        raise StreamError(f"{request.path}: --calibrate needs a reference, but there is {reference.sentence}")
     height = inputs.choose_height(recording, request.height)
     resolved, scale, notes = inputs.with_scale(resolved, recording, image, first.size_px, height)
     resolved = inputs.with_start(resolved, reference, first.t_ns + offset_ns)
@@ -370,9 +384,28 @@ class _Session:
     # ---- the loop
 
     def replay(self, writers: Writers, interrupt: Interrupt, on_progress: Callable[[Progress], None] | None) -> Outcome:
-        """Replay, judge and write."""
-        self.folder.mkdir(parents=True, exist_ok=True)
-        self._write_toml({"complete": False})
+        """Replay, judge and write; RUN.toml says how it ended."""
+        self._make_folder()
+        try:
+            summary = self._written(writers, interrupt, on_progress)
+        except KeyboardInterrupt:
+            self._write_toml({"complete": False, "summary": {"interrupted": True}})
+            raise
+        self._write_toml({"complete": True, "summary": summary})
+        return Outcome(self.folder, self._file("rrd"), self.folder / "sensors.rrd", summary)
+
+    def _make_folder(self) -> None:
+        try:
+            self.folder.mkdir(parents=True, exist_ok=True)
+            self._write_toml({"complete": False})
+        except OSError as error:
+            problem = f"no results can be written there ({error.strerror or error})"
+            raise RecordingError(self.folder, problem, "choose another folder with -o") from error
+
+    def _written(
+        self, writers: Writers, interrupt: Interrupt, on_progress: Callable[[Progress], None] | None
+    ) -> dict[str, Any]:
+        """Replay and write the recordings and the trajectory; the summary."""
         tally, path, stopped = Tally(), _Path(), ""
         with contextlib.ExitStack() as files:
             sensors = self._sensors(writers, files)
@@ -391,8 +424,7 @@ class _Session:
             summary = self._finish(sensors, run, tally, path, interrupt.requested, stopped)
         if sensors is not None and not summary["interrupted"] and not stopped:
             _replace(self.folder / "sensors.toml", to_toml(self._sensors_values()))
-        self._write_toml({"complete": True, "summary": summary})
-        return Outcome(self.folder, self._file("rrd"), self.folder / "sensors.rrd", summary)
+        return summary | {"interrupted": interrupt.requested}
 
     def _steps(self, on_progress: Callable[[Progress], None] | None) -> Generator[Replayed]:
         total = self._expected()
@@ -506,20 +538,18 @@ class _Session:
             "reference": reference,
             "evaluation": None if evaluation is None else evaluation_values(evaluation),
             "calibration": self._calibration(evaluation),
-            "suitability": suitability(tally, median_dt_s),
+            "suitability": suitability(tally, median_dt_s, evaluation),
             "notes": self.notes,
             "interrupted": interrupted,
             "stopped_early": stopped,
         }
 
     def _calibration(self, evaluation: Evaluation | None) -> dict[str, Any] | None:
-        """The price of a pixel (or the focal length) that brings the path over the reference."""
-        if not self.request.calibrate_scale:
+        """The settings that bring the path over the reference, None if nobody asked."""
+        if not self.request.calibrate:
             return None
         if evaluation is None:
-            raise EvaluationError(
-                f"{self.request.path}: --calibrate-scale: the run cannot be compared with a reference"
-            )
+            return {"key": "", "sentence": "not possible: the run cannot be compared with a reference"}
         return calibration(self.estimator.settings, evaluation)
 
     # ---- files
@@ -534,7 +564,14 @@ class _Session:
         if file.is_file() and record.is_file() and tomllib.loads(record.read_text("utf-8")) == tomllib.loads(wanted):
             return None
         record.unlink(missing_ok=True)
-        writer = writers.sensors(file, recording_id=self.recording_id, raw_images=self.request.raw_images)
+        writer = writers.sensors(
+            file,
+            recording_id=self.recording_id,
+            raw_images=self.request.raw_images,
+            run=self.name,
+            estimator=self.estimator.name,
+            step_type=self.estimator.step_type,
+        )
         files.enter_context(contextlib.closing(writer))
         writer.reference(self.reference.poses)
         return writer
@@ -547,6 +584,7 @@ class _Session:
             estimator=self.estimator.name,
             step_type=self.estimator.step_type,
             settings_text=to_toml(settings_values(self.estimator.settings)),
+            reference_xy=self.reference.path.pose[:, :2] if self.scale.known else np.empty((0, 2)),
         )
 
     @property
@@ -597,7 +635,8 @@ class _Session:
 def calibration(settings: Any, evaluation: Evaluation) -> dict[str, Any]:
     """What the scale settings would have to be, by least squares over the positions and by path length.
 
-    Where no scale can be told, `key` is empty and `sentence` says why.
+    Where the reference has headings, also the mounting yaw: a path that is turned against its own headings comes
+    of a camera that is turned in the vehicle. Where no scale can be told, `key` is empty and `sentence` says why.
     """
     key = "metres_per_px" if getattr(settings, "metres_per_px", None) is not None else "focal_px"
     used = getattr(settings, key, None)
@@ -608,10 +647,18 @@ def calibration(settings: Any, evaluation: Evaluation) -> dict[str, Any]:
     by_length = evaluation.alignment.scale * evaluation.reference_path_m / evaluation.path_m
     factors = evaluation.fitted_scale, by_length
     fit, ratio = (used * f if key == "metres_per_px" else used / f for f in factors)
-    sentence = f"{key} = {fit:.6g} by least squares, {ratio:.6g} by path length; use --set {key}={fit:.6g}"
-    if abs(ratio / fit - 1) > CALIBRATION_AGREES:
-        sentence += ", with care: the two do not agree, so that the path's shape is wrong, not only its scale"
-    return {"key": key, "least_squares": fit, "path_ratio": ratio, "sentence": sentence}
+    found = {"key": key, "least_squares": fit, "path_ratio": ratio}
+    advice = f"--set {key}={fit:.6g}"
+    offsets = evaluation.errors[:, 3]
+    if np.isfinite(offsets).any() and hasattr(settings, "mounting_yaw_rad"):
+        found["mounting_yaw_rad"] = wrap_angle(settings.mounting_yaw_rad + mean_angle(offsets))
+        advice += f" --set mounting_yaw_rad={found['mounting_yaw_rad']:.4f}"
+    if abs(ratio / fit - 1) <= CALIBRATION_AGREES:
+        advice = f"use {advice}"
+    else:
+        advice = "not to be used: the two do not agree, so that the path's shape is wrong, not only its scale"
+    sentence = f"{key} = {fit:.6g} by least squares, {ratio:.6g} by path length; {advice}"
+    return found | {"sentence": sentence}
 
 
 def tum_line(t_ns: int, pose: Floats) -> str:

@@ -9,44 +9,58 @@ from dataclasses import dataclass, field
 from typing import Any
 
 from pipelines.evaluation import Evaluation, Relative, Statistics
-from pipelines.verdict import Severity, Verdict, flags
+from pipelines.verdict import Severity, Verdict, flags, gravest
 
 NOTABLE_SHARE = 0.05
 TRUSTED_SHARE = 0.5
 MOST_CAUSES = 6
 SLOW_FRAMES_S = 0.5
+NOTABLE_DRIFT = 0.05
+STILL_M = 0.05
 
 ADVICE: Mapping[Verdict, str] = {
     Verdict.DUPLICATE_FRAME: "the log repeats frames; they carry no motion",
     Verdict.FRAME_GAP: "frames are missing in the log, or its stamps are irregular",
-    Verdict.HEIGHT_CHANGE: "the camera's height is not constant: without a height stream the scale is wrong",
+    Verdict.HEIGHT_CHANGE: "the camera's height is not constant, or it tilts: "
+    "without a height stream the scale is wrong",
     Verdict.EXPOSURE_JUMP: "the brightness changes from frame to frame: fix the exposure, or set gain_and_offset",
     Verdict.BLURRED: "motion blur: a shorter exposure is needed",
     Verdict.PEAK_AMBIGUOUS: "the surface repeats itself: a match one period away looks as good as the right one",
     Verdict.PEAK_AT_BORDER: "the motion between frames is longer than the search: raise search_radius_px",
-    Verdict.LOW_CORRELATION: "the frames do not look like their templates: no flat ground below the camera, "
-    "too little overlap, or turning too fast",
+    Verdict.LOW_CORRELATION: "the frames do not look like their templates: too little overlap, turning too fast, "
+    "or no flat ground below the camera",
     Verdict.LOW_TEXTURE: "the surface has too little texture: raise fragment_side_px",
     Verdict.APERTURE: "the texture is striped and does not tell the shift along its stripes",
     Verdict.RESIDUAL_HIGH: "the matches leave much unexplained: relief, shadows, blur or compression",
     Verdict.ROTATION_BEYOND_LIMIT: "it turns faster between frames than fragments of this size allow (1)",
     Verdict.SUBPIXEL_DIVERGED: "the subpixel refinement does not settle: false peaks or too little texture",
     Verdict.SEARCH_OUTSIDE_IMAGE: "the search areas leave the image: the motion is long or the image is small",
-    Verdict.NOT_RIGID: "the fragments do not move as one plane: relief, moving things or false peaks",
-    Verdict.TOO_FEW_INLIERS: "too few fragments agree: false peaks, relief or no flat ground below the camera",
+    Verdict.NOT_RIGID: "the fragments do not move as one plane: false peaks, relief, moving things, "
+    "or a camera that does not look straight down",
+    Verdict.TOO_FEW_INLIERS: "too few fragments agree: false peaks, relief, "
+    "or a camera that does not look straight down",
     Verdict.OUT_OF_ORDER: "stamps go backwards; those frames were skipped",
     Verdict.SIZE_CHANGED: "the image size changes within the stream",
     Verdict.UNDECODABLE: "images are damaged",
     Verdict.LOST: "the search does not lock; the path there is the last velocity held on, not a measurement",
 }
 
+CIRCUMSTANCES = Verdict.DUPLICATE_FRAME | Verdict.FRAME_GAP | Verdict.HEIGHT_CHANGE | Verdict.EXPOSURE_JUMP
+"""Alarms about the recording, not about the match: a motion that was measured under them is measured."""
+
 
 @dataclass(slots=True)
 class Tally:
-    """Counts the steps of a run while they pass by."""
+    """Counts the steps of a run while they pass by.
+
+    `used` steps have a measured motion; of those, `failed` ones broke a check that makes a motion worthless, and
+    `doubtful` ones a check that makes it uncertain.
+    """
 
     frames: int = 0
     used: int = 0
+    failed: int = 0
+    doubtful: int = 0
     verdicts: Counter[Verdict] = field(default_factory=Counter)
     alarms: Counter[Verdict] = field(default_factory=Counter)
 
@@ -54,6 +68,10 @@ class Tally:
         """Take note of one step."""
         self.frames += 1
         self.used += accepted
+        if accepted and _grave(alarms, Severity.ERROR):
+            self.failed += 1
+        elif accepted and _grave(alarms & ~CIRCUMSTANCES, Severity.WARNING):
+            self.doubtful += 1
         self.verdicts[verdict] += 1
         for flag in flags(alarms):
             self.alarms[flag] += 1
@@ -72,11 +90,11 @@ def name_of(verdict: Verdict) -> str:
     return verdict.name or "OK"
 
 
-def suitability(tally: Tally, median_dt_s: float) -> list[str]:
+def suitability(tally: Tally, median_dt_s: float, evaluation: Evaluation | None = None) -> list[str]:
     """Plain sentences on how far the method suits the recording: the upshot first, then the gravest causes."""
     if tally.frames < 2:
         return ["fewer than two frames: there is no motion to estimate"]
-    causes = []
+    causes = _disagreement(evaluation)
     if median_dt_s > SLOW_FRAMES_S:
         causes.append(
             f"median time between frames {median_dt_s:.3g} s: the method expects frames that overlap by far, "
@@ -86,17 +104,47 @@ def suitability(tally: Tally, median_dt_s: float) -> list[str]:
         share = tally.alarms[verdict] / tally.frames
         if share >= NOTABLE_SHARE:
             causes.append(f"{percent(share)} of the frames {name_of(verdict)}: {ADVICE[verdict]}")
-    return [_upshot(tally.used / (tally.frames - 1), bool(causes)), *causes[:MOST_CAUSES]]
+    return [_upshot(tally, bool(causes)), *causes[:MOST_CAUSES]]
 
 
-def _upshot(used: float, doubts: bool) -> str:
-    """How much of the path was measured, in one sentence."""
-    measured = f"{percent(min(used, 1.0))} of the motions were measured"
-    if used < TRUSTED_SHARE:
-        return f"do not trust this path: only {measured}, the others hold the last velocity"
-    if used < 1 - NOTABLE_SHARE:
-        return f"only {measured}, the others hold the last velocity"
-    return f"{measured}, but look at what follows" if doubts else f"{measured}; nothing speaks against the method here"
+def _disagreement(evaluation: Evaluation | None) -> list[str]:
+    """What the reference says against the path, which the images alone do not tell."""
+    if evaluation is None:
+        return []
+    if evaluation.reference_path_m < STILL_M:
+        moved = f"the reference moves {evaluation.reference_path_m:.2g} m in all"
+        return [f"{moved}: it hardly tells anything about the path"]
+    if not evaluation.drift > NOTABLE_DRIFT:
+        return []
+    ratio = evaluation.path_m / evaluation.reference_path_m
+    return [
+        f"the reference disagrees: the end is off by {percent(evaluation.drift)} of the path, whose length is "
+        f"{ratio:.3g} times the reference's"
+    ]
+
+
+def _upshot(tally: Tally, doubts: bool) -> str:
+    """How much of the path was measured, and how well, in one sentence."""
+    motions = tally.frames - 1
+    held, failed, doubtful = (motions - tally.used) / motions, tally.failed / motions, tally.doubtful / motions
+    parts = [f"{percent(max(held, 0.0))} hold the last velocity"] if held > 0 else []
+    parts += [f"{percent(failed)} failed a check that makes them worthless"] if tally.failed else []
+    parts += [f"{percent(doubtful)} are doubtful"] if tally.doubtful else []
+    passed = max(0, tally.used - tally.failed - tally.doubtful) / motions
+    good = f"{percent(min(passed, 1.0))} of the motions passed every check"
+    sentence = ", ".join([good, *parts])
+    if held + failed > 1 - TRUSTED_SHARE:
+        return f"do not trust this path: {sentence}"
+    return (
+        f"{sentence}; look at what follows"
+        if doubts
+        else f"{sentence}; nothing in the images speaks against the method"
+    )
+
+
+def _grave(alarms: Verdict, severity: Severity) -> bool:
+    """Whether one of the alarms is at least so grave."""
+    return gravest(alarms).severity >= severity
 
 
 def percent(share: float) -> str:
@@ -224,8 +272,3 @@ def _statistics(values: Mapping[str, float], unit: str, what: str) -> str:
 def _alignment(alignment: Mapping[str, Any]) -> str:
     scale = f" and scale {alignment['scale']:.4g}" if alignment["scale"] != 1.0 else ""
     return f"alignment in the plane (rotation {alignment['rotation_deg']:.2f}°{scale})"
-
-
-def grave(verdict: Verdict) -> bool:
-    """Whether a verdict is a warning or worse."""
-    return verdict.severity >= Severity.WARNING
