@@ -58,7 +58,7 @@ def limits_of(s: CorrelationSettings) -> Limits:
         s.max_condition,
         s.step_limit_px,
         rotation_limit(s.fragment_side_px),
-        s.max_scale_change,
+        math.inf if s.height_stream else s.max_scale_change,  # a height stream follows the change
         s.max_rigidity_px,
     )
 

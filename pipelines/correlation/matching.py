@@ -238,6 +238,8 @@ class Matcher:
             and not residual > s.max_residual_ratio * max(usual_residual, 1.0)
         )
         final, tile_shift, tile_weight = fit, layout.no_tile_shift, layout.no_tile_weight
+        if not few and 2 * fit.inliers < len(layout.centres):
+            alarms |= Verdict.NOT_RIGID
         if acceptable and len(layout.tile_centres):
             final, tile_shift, tile_weight = self._whole_frame(template, grey, layout, fit)
         rotation = 0.0 if s.mount == "gimballed" else final.rotation_rad

@@ -124,7 +124,9 @@ class CorrelationSettings(BaseModel):
     )
     max_condition: Positive = Field(9.0, description="APERTURE above (condition number of I_xyᵀ I_xy)")
     max_rigidity_px: Positive = Field(1.0, description="NOT_RIGID above, for two fragments")
-    max_scale_change: Positive = Field(0.01, description="HEIGHT_CHANGE above, of |scale - 1|")
+    max_scale_change: Positive = Field(
+        0.01, description="HEIGHT_CHANGE above, of |scale - 1|; not with a height stream"
+    )
     max_residual_ratio: Positive = Field(3.0, description="RESIDUAL_HIGH above this multiple of the running median")
     max_level_change: Positive = Field(8.0, description="EXPOSURE_JUMP above, change of the mean grey level")
     min_sharpness_ratio: Fraction = Field(0.5, description="BLURRED below this share of the running median")
