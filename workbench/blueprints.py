@@ -89,7 +89,7 @@ def correlation_blueprint(run: str, estimator: str = "correlation", bounds: Boun
         rrb.Vertical(
             rrb.Horizontal(
                 _image("/camera/image", bounds.image_px, "Image: fragments, search areas, matches",
-                       contents=["/camera/image", f"/camera/image/{run}/**"]),
+                       contents=["/camera/image", f"/camera/image/{run}/**"], hidden=[f"/camera/image/{run}/tiles"]),
                 _image(f"{root}/search/surface", bounds.surfaces_px, "Correlation surfaces"),
                 _map(run, bounds.extent),
             ),
@@ -112,12 +112,20 @@ def _panels() -> Sequence[Any]:
 
 
 def _image(
-    origin: str, size_px: tuple[float, float] | None, name: str, *, contents: Sequence[str] = ("$origin/**",)
+    origin: str,
+    size_px: tuple[float, float] | None,
+    name: str,
+    *,
+    contents: Sequence[str] = ("$origin/**",),
+    hidden: Sequence[str] = (),
 ) -> rrb.Spatial2DView:
     bounds = None
     if size_px is not None and np.isfinite(size_px).all():
         bounds = rrb.VisualBounds2D(x_range=(0.0, size_px[0]), y_range=(0.0, size_px[1]))
-    return rrb.Spatial2DView(origin=origin, contents=list(contents), name=name, visual_bounds=bounds)
+    overrides: dict[Any, Any] = {entity: rrb.EntityBehavior(visible=False) for entity in hidden}
+    return rrb.Spatial2DView(
+        origin=origin, contents=list(contents), name=name, visual_bounds=bounds, overrides=overrides
+    )
 
 
 def _axis(frames: tuple[int, int] | None) -> rrb.TimeAxis:

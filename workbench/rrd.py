@@ -423,6 +423,7 @@ class RunWriter(_Writer):
         self._file.static(f"{image}/fragments", rr.Boxes2D.from_fields(colors=0xFFFFFFB0, radii=thin, draw_order=11))
         self._file.static(f"{image}/search", rr.Boxes2D.from_fields(colors=0x4FC3F7FF, radii=thin, draw_order=10))
         self._file.static(f"{image}/matches", rr.Boxes2D.from_fields(radii=thick, draw_order=12))
+        self._file.static(f"{image}/tiles", rr.Points2D.from_fields(radii=rr.Radius.ui_points(2), draw_order=14))
         self._file.static(f"{image}/shifts", rr.Arrows2D.from_fields(radii=thick, draw_order=13))
         surface = f"{self._root}/{self._schema.entity('surface')}"
         self._file.static(
@@ -451,8 +452,9 @@ class RunWriter(_Writer):
         """Log the names of the series, which depend on the number of fragments."""
         table = traces.columns(self._schema, [step])
         for entity, values in traces.scalar_groups(self._schema, table):
-            names, colours = zip(*self._schema.series(entity, values.shape[1]), strict=True)
-            lines = rr.SeriesLines(names=names, colors=np.array(colours, np.uint32))
+            series = self._schema.series(entity, values.shape[1])
+            colours = np.array([one.colour for one in series], np.uint32)
+            lines = rr.SeriesLines(names=[one.name for one in series], colors=colours)
             self._file.static(f"{self._root}/{entity}", lines)
         labels = [str(k + 1) for k in range(table["fragment_px"].shape[1])]
         self._file.static(f"{IMAGE}/{self._run}/fragments", rr.Boxes2D.from_fields(labels=labels))
@@ -485,7 +487,8 @@ class RunWriter(_Writer):
 
     def _values(self, table: traces.Columns) -> None:
         for entity, values in traces.scalar_groups(self._schema, table):
-            self._send(entity, table, rr.Scalars.columns(scalars=values))
+            counts = np.full(len(values), values.shape[1])
+            self._send(entity, table, rr.Scalars.columns(scalars=values.ravel()).partition(counts))
         for entity, rows in self._schema.of(Archetype.INTEGERS).items():
             integers = {row.field: table[row.field] for row in rows}
             self._send(entity, table, rr.DynamicArchetype.columns(Archetype.INTEGERS.value, components=integers))
@@ -515,11 +518,13 @@ class RunWriter(_Writer):
     def _overlays(self, table: traces.Columns) -> None:
         for name, drawn in traces.overlays(table).items():
             colours: dict[str, Any] = {} if drawn.colours is None else {"colors": drawn.colours}
-            columns = (
-                rr.Arrows2D.columns(origins=drawn.points, vectors=drawn.extents, **colours)
-                if name == "shifts"
-                else rr.Boxes2D.columns(centers=drawn.points, half_sizes=drawn.extents, **colours)
-            )
+            match name:
+                case "shifts":
+                    columns = rr.Arrows2D.columns(origins=drawn.points, vectors=drawn.extents, **colours)
+                case "tiles":
+                    columns = rr.Points2D.columns(positions=drawn.points, **colours)
+                case _:
+                    columns = rr.Boxes2D.columns(centers=drawn.points, half_sizes=drawn.extents, **colours)
             self._send(f"{IMAGE}/{self._run}/{name}", table, columns.partition(drawn.counts))
 
     def _map(self, table: traces.Columns) -> None:
