@@ -48,8 +48,8 @@ class Motion(NamedTuple):
         return c * u - s * v + self.u - u, s * u + c * v + self.v - v
 
     def times(self, factor: float) -> Motion:
-        """The motion over `factor` times the time at the same velocities of shift and rotation."""
-        return Motion(self.u * factor, self.v * factor, self.rotation_rad * factor, self.scale**factor)
+        """The motion over `factor` times the time at the same velocities of shift and rotation, at one scale."""
+        return Motion(self.u * factor, self.v * factor, self.rotation_rad * factor)
 
 
 STILL = Motion(0.0, 0.0, 0.0)

@@ -126,15 +126,18 @@ def alarms_of_fit(limits, uncompensated_rad, scale, distance_px):  # type: ignor
 
 
 class Usual(NamedTuple):
-    """Running medians before a frame: residual (grey), gradient energy (grey²/px²), interval (s); NaN at first."""
+    """Running medians before a frame, NaN at first.
+
+    Residual of the match (grey), sharpness (gradient energy over squared mean grey, 1/px²), interval (s).
+    """
 
     residual: float = math.nan
-    gradient: float = math.nan
+    sharpness: float = math.nan
     interval_s: float = math.nan
 
 
 def alarms_over_time(
-    s: CorrelationSettings, residual: float, gradient: float, dt_s: float, level_change: float, usual: Usual
+    s: CorrelationSettings, residual: float, sharpness: float, dt_s: float, level_change: float, usual: Usual
 ) -> int:
     """The checks of a frame against the running medians of the frames before it, as flags of `Verdict`.
 
@@ -145,7 +148,7 @@ def alarms_over_time(
         alarms |= Verdict.EXPOSURE_JUMP
     if residual > s.max_residual_ratio * max(usual.residual, QUANTISATION):
         alarms |= Verdict.RESIDUAL_HIGH
-    if gradient < s.min_gradient_ratio * usual.gradient:
+    if sharpness < s.min_sharpness_ratio * usual.sharpness:
         alarms |= Verdict.BLURRED
     if dt_s > s.gap_factor * usual.interval_s:
         alarms |= Verdict.FRAME_GAP

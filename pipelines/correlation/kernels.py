@@ -19,12 +19,12 @@ Floats = NDArray[np.float64]
 Floats32 = NDArray[np.float32]
 Grey = NDArray[np.uint8]
 
-TAPS = 18
-"""Taps of the cardinal quintic spline; what is cut off weighs less than 5e-4."""
+TAPS = 12
+"""Taps of the cardinal quintic spline, renormalised to 1; with more of them the S-curve is no smaller."""
 POLE = 3.0**0.5 - 2.0
 """Pole of the cubic B-spline's prefilter."""
-PREFILTER_MARGIN = 8
-"""Pixels around a patch after which the prefilter has forgotten the border (POLE^8 = 3e-5)."""
+PREFILTER_MARGIN = 6
+"""Pixels around a patch after which the prefilter has forgotten the border (POLE^6 = 4e-4)."""
 ZERO, ONE, TWO, THREE = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
 """Indices of inner loops are unsigned: signed ones cost a test for a negative index, and keep loops from vectors."""
 MEDIAN_FROM = 5
@@ -129,10 +129,18 @@ def matches_of(surface: Floats32, hessian: Floats, block: Floats) -> Matches:
 _matches_of = _jit(matches_of)
 
 
+def new_matches(count: int, radius: int) -> Matches:
+    """Room for the matches of `count` fragments, for a kernel to fill."""
+    surface = np.empty((count, 2 * radius + 1, 2 * radius + 1), np.float32)
+    return matches_of(surface, np.empty((count, 2, 2)), np.empty((count, VALUES)))
+
+
 def no_matches(count: int, radius: int) -> Matches:
-    """Matches of `count` fragments in which nothing was found yet: all NaN."""
-    surface = np.full((count, 2 * radius + 1, 2 * radius + 1), np.nan, np.float32)
-    return matches_of(surface, np.full((count, 2, 2), np.nan), np.full((count, VALUES), np.nan))
+    """Matches of `count` fragments in which nothing was found: all NaN."""
+    matches = new_matches(count, radius)
+    for array in (matches.surface, matches.hessian, matches.block):
+        array[:] = np.nan
+    return matches
 
 
 # ------------------------------------------------------------------------- patches and splines
@@ -697,10 +705,10 @@ def refine(t, image, base, delta, gain_and_offset, limit, tolerance, hessian, ou
 
 @_jit
 def _note_peaks(matches, i, centre, search, radius):  # type: ignore[no-untyped-def]
-    """Find the peaks of fragment i's surface and note them; False where the surface holds no position."""
+    """Find the peaks of fragment i's surface and note them; False where it is flat or holds no position."""
     surface = matches.surface[i]
     j, k, value, second_j, second_k, second = find_peaks(surface)
-    if j < 0:
+    if j < 0 or value <= 0.0:
         return False
     matches.peak_px[i, 0] = search[i, 0] + k - radius - centre[i, 0]
     matches.peak_px[i, 1] = search[i, 1] + j - radius - centre[i, 1]
@@ -723,8 +731,10 @@ def match_one_step(previous, image, centres, search, side, radius, surface, hess
     """The paper's steps 1 and 2 for every fragment: correlation peak (2), (3), one flow step (4)-(9).
 
     `previous`, `image` uint8 [height, width]; `centres`, `search` int64 [F, 2] (u, v): fragment centres in
-    the previous frame and centres of the search areas in this one. Fills the arrays of `no_matches`.
+    the previous frame and centres of the search areas in this one. Fills the arrays of `new_matches`.
     """
+    hessian[:] = np.nan
+    block[:] = np.nan
     m = _matches_of(surface, hessian, block)
     half = (side - 1) // 2
     n = side * side
@@ -765,6 +775,8 @@ def match_iterated(  # type: ignore[no-untyped-def]
 
     `coefficients` float32 [S, S, lanes] from `spline_patches`; the rest as in `match_one_step`.
     """
+    hessian[:] = np.nan
+    block[:] = np.nan
     m = _matches_of(surface, hessian, block)
     t = templates(coefficients, side, rotation_rad)
     template = np.empty((side, side), np.float32)
@@ -855,7 +867,8 @@ def paper_fit(surface, hessian, block, points, step_limit, gimballed, covariance
     """The paper's motion from two fragments, the rear one first: (10)-(13), (15).
 
     A Δ longer than `step_limit` is rejected, not clipped: the integer shift stands. Notes shift, weight and
-    residual in the block; `covariance` [3, 3] of (m_x0, n_y0, Δα) receives that of the fragments' σ.
+    residual in the block; `covariance` [3, 3] of (m_x0, n_y0, Δα) receives that of the fragments' σ, the search
+    radius where a fragment has no σ.
 
     Returns (m_x0, n_y0, Δα, scale); NaN where a fragment has no peak.
     """
@@ -873,8 +886,13 @@ def paper_fit(surface, hessian, block, points, step_limit, gimballed, covariance
         m.weight[i] = 1.0 if np.isfinite(rotation + u) else 0.0
         m.fit_residual_px[i, 0] = points[i, 0] + m.shift_px[i, 0] - (cos * points[i, 0] - sin * points[i, 1] + u)
         m.fit_residual_px[i, 1] = points[i, 1] + m.shift_px[i, 1] - (sin * points[i, 0] + cos * points[i, 1] + v)
-    rear_u, rear_v = m.sigma_px[0, 0] ** 2, m.sigma_px[0, 1] ** 2
-    front_u, front_v = m.sigma_px[1, 0] ** 2, m.sigma_px[1, 1] ** 2
+    radius = m.surface.shape[1] // 2
+    variance = np.empty((2, 2))
+    for i in range(2):
+        for axis in range(2):
+            sigma = m.sigma_px[i, axis]
+            variance[i, axis] = sigma * sigma if np.isfinite(sigma) else float(radius * radius)
+    rear_u, rear_v, front_u, front_v = variance[0, 0], variance[0, 1], variance[1, 0], variance[1, 1]
     covariance[:] = 0.0
     covariance[0, 0], covariance[1, 1] = (front_u + rear_u) / 4.0, (front_v + rear_v) / 4.0
     covariance[2, 2] = (front_v + rear_v) / (distance * distance)
@@ -962,8 +980,8 @@ def photometric_fit(  # type: ignore[no-untyped-def]
     weight = np.zeros(count)
     residual = np.full((count, 2), np.nan)
     covariance = np.full((4, 4), np.nan)
-    inliers = 0
-    for repeat in range(5):
+    inliers, rests = 0, False
+    for _ in range(6):
         a = np.zeros((4, 4))
         b = np.zeros(4)
         cos, sin = scale * np.cos(rotation_rad), scale * np.sin(rotation_rad)
@@ -988,7 +1006,7 @@ def photometric_fit(  # type: ignore[no-untyped-def]
                 b[p] += ju[p] * (h00 * ru + h01 * rv) + jv[p] * (h01 * ru + h11 * rv)
                 for q in range(4):
                     a[p, q] += ju[p] * (h00 * ju[q] + h01 * jv[q]) + jv[p] * (h01 * ju[q] + h11 * jv[q])
-        if inliers < 2 or repeat == 4:
+        if inliers < 2 or rests or not np.linalg.det(a) > 0.0:
             break
         covariance = np.linalg.inv(a)
         step = covariance @ b
@@ -996,6 +1014,7 @@ def photometric_fit(  # type: ignore[no-untyped-def]
         mv += step[1]
         rotation_rad += step[2]
         scale *= 1.0 + step[3]
+        rests = abs(step[0]) + abs(step[1]) < 1e-6 and abs(step[2]) + abs(step[3]) < 1e-9
     return Fit(mu, mv, rotation_rad, scale, weight, residual, inliers, covariance[:3, :3].copy())
 
 

@@ -138,7 +138,7 @@ class Matcher:
             alarms |= Verdict.SEARCH_OUTSIDE_IMAGE
             if s.prediction == "last-shift":
                 search[outside] = layout.centres[outside]
-        m = kernels.no_matches(len(layout.centres), s.search_radius_px)
+        m = kernels.new_matches(len(layout.centres), s.search_radius_px)
         block = (m.surface, m.hessian, m.block)
         if s.refiner == "one-step":
             turned = 0.0
@@ -233,6 +233,7 @@ class Matcher:
         few = fit.inliers < s.min_inliers
         acceptable = (
             not few
+            and bool(np.isfinite(fit.covariance).all())
             and s.accepted_gain[0] <= gain <= s.accepted_gain[1]
             and not residual > s.max_residual_ratio * max(usual_residual, 1.0)
         )
@@ -240,8 +241,9 @@ class Matcher:
         if acceptable and len(layout.tile_centres):
             final, tile_shift, tile_weight = self._whole_frame(template, grey, layout, fit)
         rotation = 0.0 if s.mount == "gimballed" else final.rotation_rad
+        motion = Motion(final.shift_u, final.shift_v, rotation, final.scale)
         return candidate._replace(
-            motion=Motion(final.shift_u, final.shift_v, rotation, final.scale),
+            motion=motion,
             inliers=fit.inliers,
             tile_shift=tile_shift,
             tile_weight=tile_weight,

@@ -63,7 +63,7 @@ class CorrelationState:
 
     `template` is the frame that is searched next and `relative` the motion from it to the last frame;
     `previous` is the last frame. `velocity` is the last measured motion between frames, which took
-    `velocity_s`. `usual` are the running medians over `history` [3, K]: residuals, gradients, intervals.
+    `velocity_s`. `usual` are the running medians over `history` [3, K]: residuals, sharpness, intervals.
     """
 
     frames: int = 0
@@ -158,7 +158,8 @@ class CorrelationOdometry:
             return self._skip(state, sample, Verdict.OUT_OF_ORDER, grey)
         if grey.shape != previous.grey.shape:
             return self._restart(state, sample, grey, Verdict.SIZE_CHANGED)
-        if _same_image(grey, previous.grey):
+        mean_grey, gradient = kernels.frame_statistics(grey)
+        if (mean_grey, gradient) == (state.mean_grey, state.gradient) and np.array_equal(grey, previous.grey):
             return self._skip(state, sample, Verdict.DUPLICATE_FRAME, grey)
 
         s = self._settings
@@ -183,12 +184,13 @@ class CorrelationOdometry:
             alarms |= Verdict.CORRECTION_APPLIED
 
         residual = median(candidate.matches.residual_rms)
-        mean_grey, gradient = kernels.frame_statistics(grey)
-        alarms |= alarms_over_time(s, residual, gradient, dt_s, mean_grey - state.mean_grey, state.usual)
+        # over the squared mean, a longer exposure does not pass for a sharper image
+        sharpness = gradient / max(mean_grey, 1.0) ** 2
+        alarms |= alarms_over_time(s, residual, sharpness, dt_s, mean_grey - state.mean_grey, state.usual)
         accepted = candidate.acceptable
         if not accepted:
             alarms |= Verdict.LOST
-        history = self._history(state, *((residual, gradient) if accepted else (math.nan, math.nan)), dt_s)
+        history = self._history(state, *((residual, sharpness) if accepted else (math.nan, math.nan)), dt_s)
         new_state = CorrelationState(
             frames=state.frames + 1,
             template=candidate.template if accepted else self._bridge(state),
@@ -518,9 +520,3 @@ def _height_of(sample: Sample) -> float:
     if isinstance(sample, PoseSample):
         return float(sample.position_m[2])
     raise EstimatorError(f"stream {sample.stream!r} holds no heights: name a stream of ranges, numbers or poses")
-
-
-def _same_image(a: Grey, b: Grey) -> bool:
-    """Whether two images of one shape are equal pixel by pixel; one row tells most of them apart."""
-    row = a.shape[0] // 2
-    return np.array_equal(a[row], b[row]) and np.array_equal(a, b)

@@ -117,14 +117,14 @@ class CorrelationSettings(BaseModel):
     max_peak_ratio: Positive = Field(0.95, description="PEAK_AMBIGUOUS above (second peak over first)")
     min_eigenvalue: Annotated[float, Field(ge=0)] = Field(0.25, description="LOW_TEXTURE below, grey²/px² per pixel")
     min_texture_ratio: Annotated[float, Field(ge=0)] = Field(
-        2.2, description="LOW_TEXTURE where the eigenvalue is below this multiple of the noise's own"
+        1.0, description="LOW_TEXTURE where the eigenvalue is below this multiple of the noise's own"
     )
     max_condition: Positive = Field(9.0, description="APERTURE above (condition number of I_xyᵀ I_xy)")
     max_rigidity_px: Positive = Field(1.0, description="NOT_RIGID above, for two fragments")
     max_scale_change: Positive = Field(0.01, description="HEIGHT_CHANGE above, of |scale - 1|")
     max_residual_ratio: Positive = Field(3.0, description="RESIDUAL_HIGH above this multiple of the running median")
     max_level_change: Positive = Field(8.0, description="EXPOSURE_JUMP above, change of the mean grey level")
-    min_gradient_ratio: Fraction = Field(0.5, description="BLURRED below this share of the running median")
+    min_sharpness_ratio: Fraction = Field(0.5, description="BLURRED below this share of the running median")
     gap_factor: Positive = Field(1.6, description="FRAME_GAP above this multiple of the running median of dt")
     median_frames: Annotated[int, Field(ge=3, le=255)] = Field(31, description="frames of the running medians")
 
