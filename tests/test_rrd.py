@@ -391,7 +391,7 @@ def test_events_stand_where_the_verdict_changes(tmp_path: Path, monkeypatch: pyt
     events = {k: v[0] for k, v in rows_of(path, f"{root}/events", "TextLog:text").items()}
     assert sorted(events) == [0, 7, 120, 128, 140, 300, 306]
     assert events[120].startswith("PEAK_AMBIGUOUS: the second correlation peak")
-    assert events[140] == "OK again: NOT_RIGID lasted 12 frames"
+    assert events[140] == "OK again after 12 frames of NOT_RIGID"
     levels = rows_of(path, f"{root}/events", "TextLog:level")
     assert [levels[k] for k in (7, 120, 128, 140)] == [["ERROR"], ["WARN"], ["ERROR"], ["INFO"]]
     states = rows_of(path, f"{root}/verdict", "StateChange:state")

@@ -47,11 +47,15 @@ MAX_AGE_S = 0.5
 ARROW_SHARE = 0.08
 """Length of the arrows of heading, in sides of the map."""
 
+LAYER_M = 0.001
+"""Height of each layer of the map over the one below, so that what lies over one another does not flicker."""
+
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _LEVELS = {Severity.FINE: "INFO", Severity.NOTICE: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
 _COLOURS = {"reference": 0x2ECC71FF, "raw": 0x9E9E9EFF, "corrected": 0x4FC3F7FF, "aligned": 0xCE93D8FF}
+_LAYERS = ("aligned", "reference", "raw", "corrected", "markers", "arrows")
 
 
 # ---------------------------------------------------------------------------- one file
@@ -139,10 +143,11 @@ def _texts(events: Sequence[traces.Event]) -> rr.ComponentColumnList:
     return rr.TextLog.columns(text=[e.text for e in events], level=[_LEVELS[e.severity] for e in events])
 
 
-def _flat(points: Floats) -> NDArray[np.float32]:
-    """Points [n, 2] on the ground as [n, 3] in the viewer's precision."""
+def _flat(points: Floats, layer: str = "") -> NDArray[np.float32]:
+    """Points [n, 2] on the ground as [n, 3] in the viewer's precision, a hair above the layers below."""
+    z = LAYER_M * (_LAYERS.index(layer) if layer else 0)
     with np.errstate(over="ignore"):
-        return np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
+        return np.column_stack([points, np.full(len(points), z)]).astype(np.float32)
 
 
 def _document(text: str) -> rr.TextDocument:
@@ -261,9 +266,11 @@ class SensorWriter(_Writer):
         self._arrow_m = extent.size_m * ARROW_SHARE
         self._file.scale_bar(extent)
         self._file.blueprint(self._view(Bounds(extent=extent)))
-        path = rr.LineStrips3D([_flat(position[:, :2])], colors=_COLOURS["reference"], radii=rr.Radius.ui_points(1.5))
+        points = _flat(position[:, :2], "reference")
+        path = rr.LineStrips3D([points], colors=_COLOURS["reference"], radii=rr.Radius.ui_points(2.5))
         self._file.static(f"{REFERENCE}/path", path)
-        self._file.static(f"{REFERENCE}/pose", *_marker("reference"))
+        self._file.static(f"{REFERENCE}/pose", _marker("reference", 7))
+        self._file.static(f"{REFERENCE}/heading", _arrow("reference", 3))
         names = ["x [m]", "y [m]", "z [m]", "heading [rad]"]
         self._file.static("/sensors/reference", rr.SeriesLines(names=names))
         values = rr.Scalars.columns(scalars=np.column_stack([position, heading]))
@@ -295,7 +302,7 @@ class SensorWriter(_Writer):
         frames, t_ns = frames[inside], t_ns[inside]
         since, known = (t_ns - at_ns[0]).astype(float), (at_ns - at_ns[0]).astype(float)
         x, y, alpha = (np.interp(since, known, values) for values in (position[:, 0], position[:, 1], heading))
-        points = _flat(np.column_stack([x, y]))
+        points = _flat(np.column_stack([x, y]), "reference")
         self._file.send(f"{REFERENCE}/pose", frames, t_ns, rr.Points3D.columns(positions=points))
         vectors = _flat(self._arrow_m * np.column_stack([np.cos(alpha), np.sin(alpha)]))
         good = np.isfinite(vectors).all(axis=1)
@@ -324,8 +331,12 @@ def _format(pixels: NDArray[Any]) -> rr.components.ImageFormat:
     )
 
 
-def _marker(name: str) -> tuple[rr.AsComponents, ...]:
-    return (rr.Points3D.from_fields(colors=_COLOURS[name], radii=rr.Radius.ui_points(5)),)
+def _marker(name: str, radius: float) -> rr.Points3D:
+    return rr.Points3D.from_fields(colors=_COLOURS[name], radii=rr.Radius.ui_points(radius))
+
+
+def _arrow(name: str, radius: float) -> rr.Arrows3D:
+    return rr.Arrows3D.from_fields(colors=_COLOURS[name], radii=rr.Radius.ui_points(radius))
 
 
 # -------------------------------------------------------------------------------- runs
@@ -341,7 +352,7 @@ class RunWriter(_Writer):
         estimator: name of the estimator, likewise.
         step_type: class of the steps; it needs a schema.
         settings_text: the settings as they are saved beside the result.
-        extent: what of the ground the map shows until the run's own path is known, such as the reference's.
+        ground: points [n, 2] in m that the map shows beside the run's own path, such as the reference's.
 
     Raises:
         WorkbenchError: Rerun is switched off, or the Step class has no schema.
@@ -357,7 +368,7 @@ class RunWriter(_Writer):
         estimator: str,
         step_type: type[Step],
         settings_text: str,
-        extent: Extent | None = None,
+        ground: Floats | None = None,
     ) -> None:
         self._schema = schema_of(step_type)
         self._run, self._estimator = run, estimator
@@ -373,7 +384,7 @@ class RunWriter(_Writer):
         self._arrangement: bytes | None = None
         self._file.static(f"/runs/{run}/settings", rr.TextDocument(settings_text, media_type="text/plain"))
         self._constants()
-        self._bounds = Bounds(extent=extent)
+        self._bounds = Bounds(extent=None if ground is None else Extent.of(ground))
         self._view()
 
     def step(self, step: Step) -> None:
@@ -440,7 +451,8 @@ class RunWriter(_Writer):
         for name in ("raw", "corrected"):
             self._file.static(f"{self._world}/{name}", rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
         self._file.static(f"{self._world}/raw", rr.Points3D.from_fields(colors=_COLOURS["raw"]))
-        self._file.static(f"{self._world}/body", *_marker("corrected"))
+        self._file.static(f"{self._world}/body", _marker("corrected", 4.5))
+        self._file.static(f"{self._world}/heading", _arrow("corrected", 1.5))
         self._file.static(
             f"{self._world}/covariance",
             rr.Ellipsoids3D.from_fields(
@@ -530,10 +542,10 @@ class RunWriter(_Writer):
     def _map(self, table: traces.Columns) -> None:
         raw, pose = table["pose_raw"], table["pose"]
         colours = traces.verdict_colours(table["verdict"], _COLOURS["corrected"])
-        at = _flat(pose[:, :2])
-        self._send(f"{self._world}/raw", table, rr.Points3D.columns(positions=_flat(raw[:, :2])))
+        at, on_top = (_flat(pose[:, :2], layer) for layer in ("corrected", "markers"))
+        self._send(f"{self._world}/raw", table, rr.Points3D.columns(positions=_flat(raw[:, :2], "raw")))
         self._send(f"{self._world}/corrected", table, rr.Points3D.columns(positions=at, colors=colours))
-        self._send(f"{self._world}/body", table, rr.Points3D.columns(positions=at))
+        self._send(f"{self._world}/body", table, rr.Points3D.columns(positions=on_top))
         half, angle = traces.ellipses(table["pose_covariance"])
         turn = np.column_stack([np.zeros((len(at), 2)), np.sin(angle / 2), np.cos(angle / 2)])
         columns = rr.Ellipsoids3D.columns(half_sizes=_flat(np.nan_to_num(half)), centers=at, quaternions=turn)
@@ -576,21 +588,18 @@ class RunWriter(_Writer):
 
     def _line(self, name: str, points: Floats) -> None:
         finite = points[np.isfinite(points).all(axis=1)]
-        line = rr.LineStrips3D([_flat(finite)], colors=_COLOURS[name], radii=rr.Radius.ui_points(1.0))
+        line = rr.LineStrips3D([_flat(finite, name)], colors=_COLOURS[name], radii=rr.Radius.ui_points(1.0))
         self._file.static(f"{self._world}/path/{name}", line)
 
     def _finish_path(self, frames: Ints, t_ns: Ints, raw: Floats, pose: Floats) -> None:
         self._line("raw", raw[:, :2])
         self._line("corrected", pose[:, :2])
-        extent = Extent.of(pose[:, :2])
+        given = self._bounds.extent
+        extent = Extent.of(np.concatenate([pose[:, :2], *([] if given is None else [given.corners])]))
         good = np.isfinite(pose).all(axis=1)
         self._file.scale_bar(extent)
         vectors = ARROW_SHARE * extent.size_m * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
-        arrows = rr.Arrows3D.columns(vectors=_flat(vectors[good]), origins=_flat(pose[good, :2]))
-        self._file.static(
-            f"{self._world}/heading",
-            rr.Arrows3D.from_fields(colors=0xFFFFFFFF, radii=rr.Radius.ui_points(1.5)),
-        )
+        arrows = rr.Arrows3D.columns(vectors=_flat(vectors[good]), origins=_flat(pose[good, :2], "arrows"))
         self._file.send(f"{self._world}/heading", frames[good], t_ns[good], arrows)
         self._view(frames=(int(frames.min()), int(frames.max())), extent=extent)
 

@@ -547,6 +547,7 @@ class _Session:
             estimator=self.estimator.name,
             step_type=self.estimator.step_type,
             settings_text=to_toml(settings_values(self.estimator.settings)),
+            ground=self.reference.path.pose[:, :2] if self.reference.poses else None,
         )
 
     @property

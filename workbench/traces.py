@@ -310,7 +310,9 @@ class Changes:
         if verdict != Verdict.OK:
             yield Event(row, verdict.severity, f"{verdict.name}: {verdict.sentence}")
         elif self._verdict is not None and self._verdict.severity > Severity.NOTICE:
-            yield Event(row, Severity.FINE, f"OK again: {self._verdict.name} lasted {frame - self._since} frames")
+            count = frame - self._since
+            frames = f"{count} frame" + "s" * (count != 1)
+            yield Event(row, Severity.FINE, f"OK again after {frames} of {self._verdict.name}")
 
 
 def verdict_lines(table: Columns) -> list[Event]:
