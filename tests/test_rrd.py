@@ -453,7 +453,7 @@ def test_both_files_can_bring_the_same_view(tmp_path: Path, step_type: type[Step
         shown.append(view_names(tmp_path / f"{name}.rrd"))
     write_run(tmp_path / "best.rrd", fake_steps.steps(3))
     assert shown[1] == view_names(tmp_path / "best.rrd") > shown[0] - {"Image"}
-    assert {"Verdicts", "Correlation surfaces", "Events", "Position error, m"} <= shown[1]
+    assert {"Verdicts", "Correlation surfaces", "Events", "Second / first"} <= shown[1]
 
 
 def view_names(path: Path) -> set[str]:

@@ -17,9 +17,9 @@ from pipelines.estimator import Step
 
 FIELD_OF_VIEW = math.radians(55)
 """Of the viewer's eye, from top to bottom."""
-ASPECT = 1.2
+ASPECT = 1.35
 """Width over height of the map, at least."""
-MARGIN = 1.35
+MARGIN = 1.3
 
 
 @dataclass(frozen=True, slots=True)
@@ -218,9 +218,9 @@ def _plots(root: str, frames: tuple[int, int] | None) -> rrb.Tabs:
             name="Δα, α",
         ),
         rrb.Horizontal(
-            plot("Peak correlation", "search/peak_correlation", legend=False),
-            plot("Second peak over first", "search/peak_ratio", legend=False),
-            plot("Residual rms, grey", "subpixel/residual_rms", legend=False),
+            plot("Peak", "search/peak_correlation", legend=False),
+            plot("Second / first", "search/peak_ratio", legend=False),
+            plot("Residual, grey", "subpixel/residual_rms", legend=False),
             plot("Inliers", "fit/inliers", legend=False),
             name="Quality",
         ),
@@ -230,7 +230,12 @@ def _plots(root: str, frames: tuple[int, int] | None) -> rrb.Tabs:
             name="Correction",
         ),
         rrb.Horizontal(
-            plot("Position error, m", "error", show=[True, True, True, False]),
+            plot(
+                "Position error, m (x blue, y orange, distance white)",
+                "error",
+                legend=False,
+                show=[True, True, True, False],
+            ),
             plot("Heading error, rad", "error", legend=False, show=[False, False, False, True]),
             name="Errors",
         ),

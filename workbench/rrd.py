@@ -44,7 +44,7 @@ REFERENCE = "/world/reference"
 MAX_ROWS = 1024
 MAX_BYTES = 2 << 20
 MAX_AGE_S = 0.5
-ARROW_SHARE = 0.08
+ARROW_SHARE = 0.1
 """Length of the arrows of heading, in sides of the map."""
 
 LAYER_M = 0.001
@@ -54,7 +54,8 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _LEVELS = {Severity.FINE: "INFO", Severity.NOTICE: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
-_COLOURS = {"reference": 0x2ECC71FF, "raw": 0x9E9E9EFF, "corrected": 0x4FC3F7FF, "aligned": 0xCE93D8FF}
+_COLOURS = {"reference": 0x2ECC71FF, "raw": 0x9E9E9EFF, "corrected": 0x4FC3F7FF, "aligned": 0xCE93D8FF,
+            "arrow": 0xFFFFFFFF}  # fmt: skip
 _LAYERS = ("aligned", "reference", "raw", "corrected", "markers", "arrows")
 
 
@@ -404,17 +405,17 @@ class RunWriter(_Writer):
 
     def errors(self, frames: Ints, t_ns: Ints, values: Floats) -> None:
         """Log the errors against the reference: x, y, distance (m), heading (rad) [n, 4] at frames and times [n]."""
-        self._file.static(
-            f"{self._root}/error", rr.SeriesLines(names=["x [m]", "y [m]", "distance [m]", "heading [rad]"])
-        )
+        names = ["x [m]", "y [m]", "distance [m]", "heading [rad]"]
+        colours = np.array([0x42A5F5FF, 0xFFB74DFF, 0xFFFFFFFF, 0x42A5F5FF], np.uint32)
+        self._file.static(f"{self._root}/error", rr.SeriesLines(names=names, colors=colours))
         columns = rr.Scalars.columns(scalars=np.asarray(values, np.float64))
         self._file.send(f"{self._root}/error", np.asarray(frames, np.int64), np.asarray(t_ns, np.int64), columns)
 
     def finish(self, summary: Mapping[str, str | float | int], aligned_path: Floats | None) -> None:
         """Log what is known at the end: the summary, the whole path, and the path [n, 2] aligned with the reference."""
         self.flush()
-        rows = "\n".join(f"| {key} | {_number(value)} |" for key, value in summary.items())
-        self._file.static(f"/runs/{self._run}/summary", _document(f"| | |\n|---|---|\n{rows}"))
+        rows = "\n\n".join(f"**{key}** – {_number(value)}" for key, value in summary.items())
+        self._file.static(f"/runs/{self._run}/summary", _document(rows))
         if aligned_path is not None and len(aligned_path):
             self._line("aligned", aligned_path)
         if self._path:
@@ -449,10 +450,10 @@ class RunWriter(_Writer):
         labels = rr.Points2D.from_fields(colors=0xFFFFFFFF, radii=rr.Radius.ui_points(0), show_labels=True)
         self._file.static(f"{surface}/labels", labels)
         for name in ("raw", "corrected"):
-            self._file.static(f"{self._world}/{name}", rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
+            self._file.static(f"{self._world}/{name}", rr.Points3D.from_fields(radii=rr.Radius.ui_points(2)))
         self._file.static(f"{self._world}/raw", rr.Points3D.from_fields(colors=_COLOURS["raw"]))
         self._file.static(f"{self._world}/body", _marker("corrected", 4.5))
-        self._file.static(f"{self._world}/heading", _arrow("corrected", 1.5))
+        self._file.static(f"{self._world}/heading", _arrow("arrow", 1.5))
         self._file.static(
             f"{self._world}/covariance",
             rr.Ellipsoids3D.from_fields(
@@ -566,8 +567,8 @@ class RunWriter(_Writer):
             self._alarm_lanes(int(table["frame"][row]), int(table["t_ns"][row]), alarms)
 
     def _alarm_lanes(self, frame: int, t_ns: int, alarms: Verdict) -> None:
-        """One lane for every alarm that ever rang."""
-        for flag in Verdict:
+        """One lane for every alarm that ever rang; the first frame of every run needs none."""
+        for flag in (flag for flag in Verdict if flag is not Verdict.FIRST_FRAME):
             rings = flag in alarms
             if rings == self._lanes.get(flag, False):
                 continue
@@ -588,7 +589,7 @@ class RunWriter(_Writer):
 
     def _line(self, name: str, points: Floats) -> None:
         finite = points[np.isfinite(points).all(axis=1)]
-        line = rr.LineStrips3D([_flat(finite, name)], colors=_COLOURS[name], radii=rr.Radius.ui_points(1.0))
+        line = rr.LineStrips3D([_flat(finite, name)], colors=_COLOURS[name], radii=rr.Radius.ui_points(0.6))
         self._file.static(f"{self._world}/path/{name}", line)
 
     def _finish_path(self, frames: Ints, t_ns: Ints, raw: Floats, pose: Floats) -> None:

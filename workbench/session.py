@@ -462,9 +462,17 @@ class _Session:
             if stopped:
                 run.event(frame, t_ns, Severity.ERROR, stopped)
         if sensors is not None:
-            sensors.facts([*self.notes, *(f"damage: {text}" for text in damage), *facts])
+            oddities = [*(f"damage: {text}" for text in damage), *facts]
+            sensors.facts([*self._contents(), *self.notes, *(oddities or ["nothing odd was met"])])
         run.finish(_flat(lines(summary)), aligned)
         return summary
+
+    def _contents(self) -> Iterator[str]:
+        """The recording and its streams, one line each."""
+        yield f"**{self.request.path.name}** ({self.recording.format})"
+        for stream in self.recording.streams:
+            count = f", {stream.count} messages" if stream.count >= 0 else ""
+            yield f"`{stream.name}`: {stream.kind}{count}"
 
     def _evaluate(self, estimate: Trajectory) -> tuple[Evaluation | None, str]:
         """The evaluation, or why there is none."""
