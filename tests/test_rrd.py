@@ -223,7 +223,7 @@ def test_a_killed_process_loses_less_than_the_last_second(tmp_path: Path) -> Non
         env=dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path)),
     )
     assert child.stdout is not None
-    logged = [line.split() for line, _ in zip(child.stdout, range(120), strict=False)]
+    logged = [line.split() for _, line in zip(range(120), child.stdout, strict=False)]
     child.send_signal(signal.SIGKILL)
     logged += [line.split() for line in child.stdout if line.endswith("\n")]
     child.wait()

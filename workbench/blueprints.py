@@ -35,16 +35,17 @@ class Extent:
     def of(cls, points: NDArray[np.float64]) -> Extent:
         """The rectangle around points [n, 2]; 1 m where they do not tell."""
         finite = points[np.isfinite(points).all(axis=1)]
-        if not len(finite) or not np.ptp(finite, axis=0).any():
-            return cls(*(finite[0] if len(finite) else (0.0, 0.0)), 1.0, 1.0)
+        if not len(finite):
+            return cls(0.0, 0.0, 1.0, 1.0)
         low, high = finite.min(axis=0), finite.max(axis=0)
-        return cls(*((low + high) / 2).tolist(), *(high - low).tolist())
+        (x, y), (width, height) = ((low + high) / 2).tolist(), (high - low).tolist()
+        return cls(x, y, width, height) if width or height else cls(x, y, 1.0, 1.0)
 
     @property
     def corners(self) -> NDArray[np.float64]:
         """Two opposite corners [2, 2]."""
-        half = np.array([self.width_m, self.height_m]) / 2
-        return np.array([self.x_m, self.y_m]) + np.array([-half, half])
+        x, y = self.width_m / 2, self.height_m / 2
+        return np.array([[self.x_m - x, self.y_m - y], [self.x_m + x, self.y_m + y]])
 
     @property
     def size_m(self) -> float:

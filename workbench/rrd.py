@@ -386,7 +386,6 @@ class RunWriter(_Writer):
         self._file.static(f"/runs/{run}/settings", rr.TextDocument(settings_text, media_type="text/plain"))
         self._constants()
         self._bounds = Bounds(extent=None if ground is None else Extent.of(ground))
-        self._view()
 
     def step(self, step: Step) -> None:
         """Log one step."""
@@ -421,6 +420,8 @@ class RunWriter(_Writer):
         if self._path:
             frames, t_ns, raw, pose = (np.concatenate(column) for column in zip(*self._path, strict=True))
             self._finish_path(frames, t_ns, raw, pose)
+        else:
+            self._view()
 
     # ---- what is logged once
 

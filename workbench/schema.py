@@ -253,7 +253,7 @@ This page is made by `python -m workbench.schema`; a test demands that it is cur
 | Entity | What |
 |---|---|
 | `/runs/RUN/settings`, `/runs/RUN/summary` | settings, and what was found at the end |
-| `/runs/RUN/ESTIMATOR/verdict`, `/verdicts/NAME` | state lanes: the verdict, and each alarm that ever rang (save FIRST_FRAME) |
+| `/runs/RUN/ESTIMATOR/verdict`, `/verdicts/NAME` | lanes: the verdict, each alarm that ever rang (save FIRST_FRAME) |
 | `/runs/RUN/ESTIMATOR/events` | log of where the verdict changed, and of what the replay met |
 | `/runs/RUN/ESTIMATOR/alarms` | log of every frame with an alarm |
 | `/runs/RUN/ESTIMATOR/numbers` | matrices and fragments of the frame as tables |
