@@ -67,11 +67,16 @@ def test_surface_is_nan_outside_the_image_and_zero_where_it_is_flat() -> None:
 def test_peaks_are_the_highest_and_the_next_hill() -> None:
     v, u = np.mgrid[0:33, 0:33]
     surface = np.exp(-((u - 20) ** 2 + (v - 9) ** 2) / 8) + 0.6 * np.exp(-((u - 5) ** 2 + (v - 28) ** 2) / 8)
-    j, i, value, second_j, second_i, second = kernels.find_peaks(surface.astype(np.float32))
+    j, i, value, second_j, second_i, second = kernels.find_peaks(surface.astype(np.float32), 0.0)
     assert (j, i, second_j, second_i) == (9, 20, 28, 5)
     assert (value, second) == pytest.approx((1.0, 0.6), abs=1e-6)
+    rivals = surface + 0.97 * np.exp(-((u - 15) ** 2 + (v - 17) ** 2) / 8)
+    assert kernels.find_peaks(rivals.astype(np.float32), 0.0)[:2] == (9, 20)
+    j, i, value, second_j, second_i, second = kernels.find_peaks(rivals.astype(np.float32), 0.05)
+    assert (j, i, second_j, second_i) == (17, 15, 9, 20)  # nearest to the middle
+    assert second > value
     surface[:] = np.nan
-    assert kernels.find_peaks(surface.astype(np.float32))[0] == -1
+    assert kernels.find_peaks(surface.astype(np.float32), 0.0)[0] == -1
 
 
 def test_quadric_gives_vertex_curvature_and_anisotropy() -> None:
@@ -139,7 +144,7 @@ def test_refinement_is_exact_on_a_spline_without_noise() -> None:
     m = kernels.new_matches(2, 4)
     coefficients = kernels.spline_patches(image.astype(np.uint8), centres, 21)
     kernels.match_iterated(
-        coefficients, np.round(moved).clip(0, 255).astype(np.uint8), centres, centres, 0.0, 21, 4, True, 20, 1e-6,
+        coefficients, np.round(moved).clip(0, 255).astype(np.uint8), centres, centres, 0.0, 21, 4, 0.0, True, 20, 1e-6,
         m.surface, m.hessian, m.block,
     )  # fmt: skip
     np.testing.assert_allclose(m.shift_px, [[0.37, -0.21]] * 2, atol=0.004)  # rounding to grey levels remains
@@ -153,7 +158,7 @@ def test_refinement_estimates_gain_and_offset() -> None:
     m = kernels.new_matches(1, 4)
     coefficients = kernels.spline_patches(image, centres, 21)
     kernels.match_iterated(
-        coefficients, other, centres, centres, 0.0, 21, 4, True, 10, 1e-4, m.surface, m.hessian, m.block
+        coefficients, other, centres, centres, 0.0, 21, 4, 0.0, True, 10, 1e-4, m.surface, m.hessian, m.block
     )
     assert m.gain[0] == pytest.approx(0.8, abs=0.01)
     assert m.offset[0] == pytest.approx(13, abs=1)
@@ -273,8 +278,8 @@ class Errors:
             m = kernels.new_matches(len(self.centres), radius)
             search = self.centres + np.floor(truth + np.array([3.5, -1.5])).astype(np.int64)
             kernels.match_iterated(
-                kernels.spline_patches(a, self.centres, self.side), b, self.centres, search, turned, self.side, radius,
-                gain_and_offset, 10, 1e-3, m.surface, m.hessian, m.block,
+                kernels.spline_patches(a, self.centres, self.side), b, self.centres, search, turned, self.side,
+                radius, 0.0, gain_and_offset, 10, 1e-3, m.surface, m.hessian, m.block,
             )  # fmt: skip
             yield m, truth
 

@@ -413,6 +413,20 @@ def test_stripes_and_repetition() -> None:
     assert alarms_at(steps, Verdict.PEAK_AMBIGUOUS) == {1, 2}
 
 
+def test_a_grating_is_told_and_crossed_at_the_predicted_speed() -> None:
+    # a lattice of 10 px slides over the way: every period is as good a match, only the prediction tells them apart
+    drive = Drive("b_01", eight(60, 2.0))
+    u, v = np.meshgrid(np.arange(512), np.arange(512))
+    forward = np.concatenate([[0], np.cumsum(-way.image_motion(drive.poses, W)[0][:, 0])])
+    covered = {}
+    for k in range(46, 50):
+        lattice = 120 + 50 * np.sin((u + forward[k]) * 2 * np.pi / 10) * np.sin(v * 2 * np.pi / 10)
+        covered[k] = np.clip(lattice + np.random.default_rng(k).normal(0, 2, lattice.shape), 0, 255).astype(np.uint8)
+    steps = run(settings("best", start_pose=tuple(drive.poses[0])), replaced(drive.samples(), covered))
+    assert alarms_at(steps, Verdict.PEAK_AMBIGUOUS | Verdict.LOST) >= {47, 48, 49}
+    assert np.hypot(*(steps[-1].pose - drive.poses[-1])[:2]) < 0.01
+
+
 def test_height_change() -> None:
     drive = Drive("b_01", way.standstill(1))
     frame = drive.frames[0]
@@ -487,6 +501,14 @@ def test_size_change_begins_again(short_drive: Drive) -> None:
     assert alarms_at(steps, Verdict.SIZE_CHANGED) == {3}
     assert steps[4].accepted
     assert steps[4].image_size_px.tolist() == [480, 400]
+
+
+def test_a_thumbnail_among_frames_is_passed_over(short_drive: Drive) -> None:
+    samples = short_drive.samples()[:8]
+    samples[4] = image(np.ascontiguousarray(short_drive.frames[4][::16, ::16]), 4)
+    steps = run(settings("best", start_pose=tuple(short_drive.poses[0])), samples)
+    assert alarms_at(steps, Verdict.SIZE_CHANGED) == {4}
+    assert np.hypot(*(steps[-1].pose - short_drive.poses[7])[:2]) < 5e-4
 
 
 # ------------------------------------------------------------------------------------- contract

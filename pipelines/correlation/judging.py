@@ -137,18 +137,25 @@ class Usual(NamedTuple):
 
 
 def alarms_over_time(
-    s: CorrelationSettings, residual: float, sharpness: float, dt_s: float, level_change: float, usual: Usual
+    s: CorrelationSettings,
+    residual: float,
+    gain: float,
+    sharpness: float,
+    dt_s: float,
+    level_change: float,
+    usual: Usual,
 ) -> int:
     """The checks of a frame against the running medians of the frames before it, as flags of `Verdict`.
 
-    `level_change` is that of the mean grey level since the frame before.
+    `gain` is that of the match, `level_change` that of the mean grey level since the frame before. A frame is
+    blurred where sharpness and gain fall together: over a smoother surface only the sharpness does.
     """
     alarms = 0
     if abs(level_change) > s.max_level_change:
         alarms |= Verdict.EXPOSURE_JUMP
     if residual > s.max_residual_ratio * max(usual.residual, QUANTISATION):
         alarms |= Verdict.RESIDUAL_HIGH
-    if sharpness < s.min_sharpness_ratio * usual.sharpness:
+    if sharpness < s.min_sharpness_ratio * usual.sharpness and gain < s.blurred_gain:
         alarms |= Verdict.BLURRED
     if dt_s > s.gap_factor * usual.interval_s:
         alarms |= Verdict.FRAME_GAP

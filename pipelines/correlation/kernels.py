@@ -26,6 +26,7 @@ POLE = 3.0**0.5 - 2.0
 PREFILTER_MARGIN = 6
 """Pixels around a patch after which the prefilter has forgotten the border (POLE^6 = 4e-4)."""
 ZERO, ONE, TWO, THREE = np.uint64(0), np.uint64(1), np.uint64(2), np.uint64(3)
+FOUR, FIVE, SIX = np.uint64(4), np.uint64(5), np.uint64(6)
 """Indices of inner loops are unsigned: signed ones cost a test for a negative index, and keep loops from vectors."""
 MEDIAN_FROM = 5
 """A running median counts from this many values on."""
@@ -288,12 +289,20 @@ def _basis_5(t):  # type: ignore[no-untyped-def]
 @_jit
 def _cardinal_weights(fraction, weights):  # type: ignore[no-untyped-def]
     """Weights of the TAPS pixels around a position, `fraction` after the (TAPS/2)th of them (quintic spline)."""
+    basis = (
+        _basis_5(fraction + 2.0),
+        _basis_5(fraction + 1.0),
+        _basis_5(fraction),
+        _basis_5(fraction - 1.0),
+        _basis_5(fraction - 2.0),
+        _basis_5(fraction - 3.0),
+    )
     total = 0.0
     first = 1 - TAPS // 2
     for k in range(TAPS):
         w = 0.0
-        for m in range(-2, 4):
-            w += _basis_5(fraction - m) * _CARDINAL[TAPS + k + first - m]
+        for m in range(6):
+            w += basis[m] * _CARDINAL[TAPS + k + first - (m - 2)]
         weights[k] = w
         total += w
     for k in range(TAPS):
@@ -317,20 +326,29 @@ def _shifted(image, u, v, work, out, lane):  # type: ignore[no-untyped-def]
     _cardinal_weights(v - iv, weights_v)
     before = TAPS // 2 - 1
     _copy_window(image, iv - half - before, iu - half - before, window)
-    width, size = np.uint64(window.shape[1]), np.uint64(side)
+    # whole vectors: what lies beyond the fragment is computed and left
+    width, padded, size = np.uint64(window.shape[1]), np.uint64(len(target)), np.uint64(side)
     for y in range(size):
         for x in range(width):
             row[x] = 0.0
-        for k in range(ZERO, np.uint64(TAPS), THREE):
+        for k in range(ZERO, np.uint64(TAPS), SIX):
             w0, w1, w2 = np.float32(weights_v[k]), np.float32(weights_v[k + ONE]), np.float32(weights_v[k + TWO])
+            w3, w4 = np.float32(weights_v[k + THREE]), np.float32(weights_v[k + FOUR])
+            w5 = np.float32(weights_v[k + FIVE])
             for x in range(width):
-                row[x] += w0 * window[y + k, x] + w1 * window[y + k + ONE, x] + w2 * window[y + k + TWO, x]
-        for x in range(size):
+                near = w2 * window[y + k + TWO, x] + w3 * window[y + k + THREE, x]
+                far = w0 * window[y + k, x] + w5 * window[y + k + FIVE, x]
+                row[x] += near + far + (w1 * window[y + k + ONE, x] + w4 * window[y + k + FOUR, x])
+        for x in range(padded):
             target[x] = 0.0
-        for k in range(ZERO, np.uint64(TAPS), THREE):
+        for k in range(ZERO, np.uint64(TAPS), SIX):
             w0, w1, w2 = np.float32(weights_u[k]), np.float32(weights_u[k + ONE]), np.float32(weights_u[k + TWO])
-            for x in range(size):
-                target[x] += w0 * row[x + k] + w1 * row[x + k + ONE] + w2 * row[x + k + TWO]
+            w3, w4 = np.float32(weights_u[k + THREE]), np.float32(weights_u[k + FOUR])
+            w5 = np.float32(weights_u[k + FIVE])
+            for x in range(padded):
+                near = w2 * row[x + k + TWO] + w3 * row[x + k + THREE]
+                far = w0 * row[x + k] + w5 * row[x + k + FIVE]
+                target[x] += near + far + (w1 * row[x + k + ONE] + w4 * row[x + k + FOUR])
         for x in range(size):
             out[y, x, lane] = target[x]
 
@@ -429,10 +447,23 @@ def correlation_surface(template, image, u, v, radius, surface):  # type: ignore
 
 
 @_jit
-def find_peaks(surface):  # type: ignore[no-untyped-def]
-    """Highest position of a surface, and the highest local maximum outside its hill.
+def _is_hilltop(surface, j, i):  # type: ignore[no-untyped-def]
+    """Whether no neighbour of a position is higher."""
+    size = surface.shape[0]
+    for y in range(max(j - 1, 0), min(j + 2, size)):
+        for x in range(max(i - 1, 0), min(i + 2, size)):
+            if surface[y, x] > surface[j, i]:
+                return False
+    return True
 
-    Returns (row, column, value, second row, second column, second value); rows of -1 where there is none.
+
+@_jit
+def find_peaks(surface, ambiguity):  # type: ignore[no-untyped-def]
+    """The peak of a surface, and the highest local maximum outside its hill.
+
+    The peak is the highest position; of local maxima that are lower by at most `ambiguity` it is the one nearest
+    to the middle, that is, to the prediction. Returns (row, column, value, second row, second column, second
+    value); rows of -1 where there is none.
     """
     size = surface.shape[0]
     best_j, best_i, best = -1, -1, -2.0
@@ -440,19 +471,20 @@ def find_peaks(surface):  # type: ignore[no-untyped-def]
         for i in range(size):
             if surface[j, i] > best:
                 best_j, best_i, best = j, i, surface[j, i]
+    if ambiguity > 0.0 and best_j >= 0:
+        middle, least = size // 2, best - ambiguity
+        nearest = (best_j - middle) ** 2 + (best_i - middle) ** 2
+        for j in range(size):
+            for i in range(size):
+                distance = (j - middle) ** 2 + (i - middle) ** 2
+                if surface[j, i] >= least and distance < nearest and _is_hilltop(surface, j, i):
+                    best_j, best_i, best, nearest = j, i, surface[j, i], distance
     second_j, second_i, second = -1, -1, -2.0
     for j in range(size):
         for i in range(size):
-            value = surface[j, i]
-            if not value > second or (abs(j - best_j) <= HILL_PX and abs(i - best_i) <= HILL_PX):
-                continue
-            highest = True
-            for y in range(max(j - 1, 0), min(j + 2, size)):
-                for x in range(max(i - 1, 0), min(i + 2, size)):
-                    if surface[y, x] > value:
-                        highest = False
-            if highest:
-                second_j, second_i, second = j, i, value
+            beside = abs(j - best_j) <= HILL_PX and abs(i - best_i) <= HILL_PX
+            if surface[j, i] > second and not beside and _is_hilltop(surface, j, i):
+                second_j, second_i, second = j, i, surface[j, i]
     return best_j, best_i, best, second_j, second_i, second
 
 
@@ -538,11 +570,11 @@ class _Scratch(NamedTuple):
 
 @_jit
 def _scratch(side):  # type: ignore[no-untyped-def]
-    width = side + TAPS - 1
+    whole, width = (side + 7) // 8 * 8, (side + TAPS - 1 + 7) // 8 * 8
     return _Scratch(
-        np.empty((width, width), np.float32),
-        np.empty(width, np.float32),
-        np.empty(side, np.float32),
+        np.empty((side + TAPS - 1, width), np.float32),
+        np.zeros(max(width, whole + TAPS), np.float32),
+        np.empty(whole, np.float32),
         np.empty(TAPS),
         np.empty(TAPS),
     )
@@ -704,10 +736,10 @@ def refine(t, image, base, delta, gain_and_offset, limit, tolerance, hessian, ou
 
 
 @_jit
-def _note_peaks(matches, i, centre, search, radius):  # type: ignore[no-untyped-def]
+def _note_peaks(matches, i, centre, search, radius, ambiguity):  # type: ignore[no-untyped-def]
     """Find the peaks of fragment i's surface and note them; False where it is flat or holds no position."""
     surface = matches.surface[i]
-    j, k, value, second_j, second_k, second = find_peaks(surface)
+    j, k, value, second_j, second_k, second = find_peaks(surface, ambiguity)
     if j < 0 or value <= 0.0:
         return False
     matches.peak_px[i, 0] = search[i, 0] + k - radius - centre[i, 0]
@@ -743,7 +775,7 @@ def match_one_step(previous, image, centres, search, side, radius, surface, hess
         u, v = centres[i]
         _copy_window(previous, v - half, u - half, template)
         correlation_surface(template, image, search[i, 0], search[i, 1], radius, m.surface[i])
-        if not _note_peaks(m, i, centres, search, radius):
+        if not _note_peaks(m, i, centres, search, radius, 0.0):
             continue
         pu, pv = int(m.peak_px[i, 0]), int(m.peak_px[i, 1])
         m.delta_px[i, 0], m.delta_px[i, 1], m.residual_rms[i] = one_step(
@@ -768,12 +800,13 @@ def match_one_step(previous, image, centres, search, side, radius, surface, hess
 
 @_jit
 def match_iterated(  # type: ignore[no-untyped-def]
-    coefficients, image, centres, search, rotation_rad, side, radius, gain_and_offset, limit, tolerance,
+    coefficients, image, centres, search, rotation_rad, side, radius, ambiguity, gain_and_offset, limit, tolerance,
     surface, hessian, block,
 ):  # fmt: skip
     """Correlation peak with the turned templates, then the iterated refinement, for every fragment.
 
-    `coefficients` float32 [S, S, lanes] from `spline_patches`; the rest as in `match_one_step`.
+    `coefficients` float32 [S, S, lanes] from `spline_patches`, `ambiguity` as in `find_peaks`; the rest as in
+    `match_one_step`.
     """
     hessian[:] = np.nan
     block[:] = np.nan
@@ -786,7 +819,7 @@ def match_iterated(  # type: ignore[no-untyped-def]
                 template[y, x] = t[0, y, x, i]
         correlation_surface(template, image, search[i, 0], search[i, 1], radius, m.surface[i])
         m.iterations[i] = 0
-        _note_peaks(m, i, centres, search, radius)
+        _note_peaks(m, i, centres, search, radius, ambiguity)
     _refine_matches(m, t, image, centres, gain_and_offset, limit, tolerance)
 
 

@@ -151,7 +151,7 @@ class Matcher:
             turned = predicted.rotation_rad if turn else 0.0
             kernels.match_iterated(
                 template.fragments, grey, layout.centres, search, turned, s.fragment_side_px,
-                s.search_radius_px, s.gain_and_offset, s.max_iterations, s.tolerance_px, *block,
+                s.search_radius_px, s.ambiguity, s.gain_and_offset, s.max_iterations, s.tolerance_px, *block,
             )  # fmt: skip
         if s.motion == "paper":
             return self._paper_motion(template, expected, search, m, layout, alarms)

@@ -186,7 +186,8 @@ class CorrelationOdometry:
         residual = median(candidate.matches.residual_rms)
         # over the squared mean, a longer exposure does not pass for a sharper image
         sharpness = gradient / max(mean_grey, 1.0) ** 2
-        alarms |= alarms_over_time(s, residual, sharpness, dt_s, mean_grey - state.mean_grey, state.usual)
+        gain = median(candidate.matches.gain)
+        alarms |= alarms_over_time(s, residual, gain, sharpness, dt_s, mean_grey - state.mean_grey, state.usual)
         accepted = candidate.acceptable
         if not accepted:
             alarms |= Verdict.LOST
@@ -347,7 +348,12 @@ class CorrelationOdometry:
         self, state: CorrelationState, sample: ImageSample, grey: Grey, verdict: Verdict
     ) -> tuple[CorrelationState, CorrelationStep]:
         """Begin, or begin again after the image size changed: there is nothing to compare this frame with."""
-        self._matcher.layout(grey.shape[1], grey.shape[0])
+        try:
+            self._matcher.layout(grey.shape[1], grey.shape[0])
+        except EstimatorError:
+            if verdict is Verdict.FIRST_FRAME:
+                raise
+            return self._skip(state, sample, verdict, None)  # a small picture among larger ones
         assert state.covariance is not None
         frame = _frame_of(state, sample)
         this = Template(frame, grey, state.pose, state.covariance)

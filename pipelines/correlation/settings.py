@@ -55,6 +55,9 @@ class CorrelationSettings(BaseModel):
     search_radius_px: Annotated[int, Field(ge=2, le=256)] = Field(
         8, description="reach of the search around its centre"
     )
+    ambiguity: Fraction = Field(
+        0.03, description="of peaks that differ by less, the one nearest to the prediction; 0: the highest"
+    )
     prediction: Literal["none", "last-shift", "constant-velocity"] = Field(
         "constant-velocity", description="centre of the search: zero, each fragment's last shift, rigid motion x dt"
     )
@@ -75,8 +78,8 @@ class CorrelationSettings(BaseModel):
     robust_scale_px: Positive = Field(0.3, description="residual at which a fragment loses half its weight")
     inlier_px: Positive = Field(1.0, description="largest residual of a fragment that agrees")
     min_inliers: Annotated[int, Field(ge=2)] = Field(3, description="fewer reject the frame")
-    tile_columns: Annotated[int, Field(ge=0, le=32)] = Field(9, description="photometric tiles along u, 0: none")
-    tile_rows: Annotated[int, Field(ge=0, le=32)] = Field(8, description="photometric tiles along v, 0: none")
+    tile_columns: Annotated[int, Field(ge=0, le=32)] = Field(10, description="photometric tiles along u, 0: none")
+    tile_rows: Annotated[int, Field(ge=0, le=32)] = Field(9, description="photometric tiles along v, 0: none")
     tile_side_px: Annotated[int, Field(ge=5, le=63)] = Field(21, description="side of a tile, odd")
     tile_rounds: Annotated[int, Field(ge=1, le=10)] = Field(3, description="most rounds of the photometric step")
     tile_tolerance_px: Positive = Field(0.03, description="a round that moves the frame less is the last one")
@@ -125,6 +128,7 @@ class CorrelationSettings(BaseModel):
     max_residual_ratio: Positive = Field(3.0, description="RESIDUAL_HIGH above this multiple of the running median")
     max_level_change: Positive = Field(8.0, description="EXPOSURE_JUMP above, change of the mean grey level")
     min_sharpness_ratio: Fraction = Field(0.5, description="BLURRED below this share of the running median")
+    blurred_gain: Positive = Field(0.9, description="… where the gain of the match is below this as well")
     gap_factor: Positive = Field(1.6, description="FRAME_GAP above this multiple of the running median of dt")
     median_frames: Annotated[int, Field(ge=3, le=255)] = Field(31, description="frames of the running medians")
 
@@ -168,6 +172,7 @@ class CorrelationSettings(BaseModel):
                 fragment_side_px=9,
                 span_u_px=200.0,
                 search_radius_px=16,
+                ambiguity=0.0,
                 prediction="last-shift",
                 refiner="one-step",
                 rotate_template=False,
