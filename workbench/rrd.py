@@ -622,7 +622,7 @@ def read_steps(path: Path | str, run: str, step_type: type[Step]) -> list[Step]:
     """The Steps of a run, from a finished file or from what a killed process left.
 
     Every number is exactly the one that was logged, surfaces within the step of float16. All steps stand in
-    memory at once, about 50 kB each with nine surfaces: of a long run, take single fields with `read_fields`.
+    memory at once, about 25 kB each with nine surfaces: of a long run, take single fields with `read_fields`.
 
     Raises:
         RecordingError: the file cannot be read, or holds no such run.
