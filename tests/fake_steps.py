@@ -30,6 +30,14 @@ def fragments(count: int) -> NDArray[np.float64]:
     return np.column_stack([u.ravel(), v.ravel()])
 
 
+def tiles(fragment_count: int) -> NDArray[np.float64]:
+    """Centres of the photometric tiles: none with two fragments, else 9 x 8."""
+    if fragment_count == 2:
+        return np.empty((0, 2))
+    u, v = np.meshgrid(np.linspace(13.0, 498.0, 9), np.linspace(13.0, 498.0, 8))
+    return np.column_stack([u.ravel(), v.ravel()])
+
+
 def path(frame: float) -> NDArray[np.float64]:
     """True x, y, heading: a loop that starts eastward."""
     a = 2 * math.pi * frame / 1500
@@ -55,7 +63,7 @@ def alarms_of(frame: int) -> Verdict:
 def steps(count: int, *, fragment_count: int = 9, seed: int = 1, start: int = 0) -> Iterator[CorrelationStep]:
     rng = np.random.default_rng(seed)
     f = fragment_count
-    centres = fragments(f)
+    centres, tile_centres = fragments(f), tiles(f)
     side = 2 * RADIUS + 1
     grid = np.arange(side) - RADIUS
     raw = path(start)
@@ -97,6 +105,8 @@ def steps(count: int, *, fragment_count: int = 9, seed: int = 1, start: int = 0)
         step_m = float(np.hypot(*moved[:2]))
         sum_m, reference_m = sum_m + step_m, reference_m + float(np.hypot(*(now - before)[:2]))
 
+        tile_shift = -body[:2] / W * [1, -1] + rng.normal(0, 0.05, tile_centres.shape)
+
         def unless_first(values: NDArray[np.float64], first: bool = first) -> NDArray[np.float64]:
             return np.full(np.shape(values), np.nan) if first else np.asarray(values, float)
 
@@ -132,6 +142,8 @@ def steps(count: int, *, fragment_count: int = 9, seed: int = 1, start: int = 0)
             iterations=unless_first(rng.integers(2, 6, f).astype(float)),
             gain=unless_first(rng.normal(1, 0.01, f)),
             offset=unless_first(rng.normal(0, 1, f)),
+            match_grey=unless_first(rng.normal(120, 5, f)),
+            gradient=rng.normal(300, 10, f),
             residual_rms=unless_first(rng.normal(3, 0.2, f)),
             sigma_px=unless_first(rng.uniform(0.01, 0.03, (f, 2))),
             shift_px=unless_first(shift),
@@ -142,6 +154,9 @@ def steps(count: int, *, fragment_count: int = 9, seed: int = 1, start: int = 0)
             scale=math.nan if first else float(rng.normal(1, 1e-4)),
             centre_shift_px=unless_first(shift.mean(0)),
             template_rotation_rad=math.nan if first else float(moved[2]),
+            tile_px=tile_centres,
+            tile_shift_px=unless_first(tile_shift),
+            tile_weight=np.zeros(len(tile_centres)) if first else rng.uniform(0, 1, len(tile_centres)),
             motion_covariance=unless_first(np.diag([4e-4, 4e-4, 1e-8]) + 1e-9),
             rotation_limit_rad=1 / SIDE,
             frame_shift_px=unless_first(shift.mean(0)),

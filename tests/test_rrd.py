@@ -223,7 +223,7 @@ def test_a_killed_process_loses_less_than_the_last_second(tmp_path: Path) -> Non
         env=dict(os.environ, PYTHONPATH=os.pathsep.join(sys.path)),
     )
     assert child.stdout is not None
-    logged = [line.split() for line, _ in zip(child.stdout, range(120), strict=False)]
+    logged = [line.split() for _, line in zip(range(120), child.stdout, strict=False)]
     child.send_signal(signal.SIGKILL)
     logged += [line.split() for line in child.stdout if line.endswith("\n")]
     child.wait()
@@ -391,7 +391,7 @@ def test_events_stand_where_the_verdict_changes(tmp_path: Path, monkeypatch: pyt
     events = {k: v[0] for k, v in rows_of(path, f"{root}/events", "TextLog:text").items()}
     assert sorted(events) == [0, 7, 120, 128, 140, 300, 306]
     assert events[120].startswith("PEAK_AMBIGUOUS: the second correlation peak")
-    assert events[140] == "OK again: NOT_RIGID lasted 12 frames"
+    assert events[140] == "OK again after 12 frames of NOT_RIGID"
     levels = rows_of(path, f"{root}/events", "TextLog:level")
     assert [levels[k] for k in (7, 120, 128, 140)] == [["ERROR"], ["WARN"], ["ERROR"], ["INFO"]]
     states = rows_of(path, f"{root}/verdict", "StateChange:state")
@@ -453,7 +453,7 @@ def test_both_files_can_bring_the_same_view(tmp_path: Path, step_type: type[Step
         shown.append(view_names(tmp_path / f"{name}.rrd"))
     write_run(tmp_path / "best.rrd", fake_steps.steps(3))
     assert shown[1] == view_names(tmp_path / "best.rrd") > shown[0] - {"Image"}
-    assert {"Verdicts", "Correlation surfaces", "Events", "Position error, m"} <= shown[1]
+    assert {"Verdicts", "Correlation surfaces", "Events", "Second / first"} <= shown[1]
 
 
 def view_names(path: Path) -> set[str]:

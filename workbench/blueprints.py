@@ -15,30 +15,54 @@ from numpy.typing import NDArray
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
 
+FIELD_OF_VIEW = math.radians(55)
+"""Of the viewer's eye, from top to bottom."""
+ASPECT = 1.35
+"""Width over height of the map, at least."""
+MARGIN = 1.3
+
 
 @dataclass(frozen=True, slots=True)
 class Extent:
-    """A square on the ground: centre (x, y) and side in metres."""
+    """A rectangle on the ground: centre (x, y), width along x and height along y in metres."""
 
     x_m: float
     y_m: float
-    size_m: float
+    width_m: float
+    height_m: float
 
     @classmethod
     def of(cls, points: NDArray[np.float64]) -> Extent:
-        """The square around points [n, 2]; 1 m where they do not tell."""
+        """The rectangle around points [n, 2]; 1 m where they do not tell."""
         finite = points[np.isfinite(points).all(axis=1)]
         if not len(finite):
-            return cls(0.0, 0.0, 1.0)
+            return cls(0.0, 0.0, 1.0, 1.0)
         low, high = finite.min(axis=0), finite.max(axis=0)
-        x, y = (low + high) / 2
-        return cls(float(x), float(y), float((high - low).max()) or 1.0)
+        (x, y), (width, height) = ((low + high) / 2).tolist(), (high - low).tolist()
+        return cls(x, y, width, height) if width or height else cls(x, y, 1.0, 1.0)
+
+    @property
+    def corners(self) -> NDArray[np.float64]:
+        """Two opposite corners [2, 2]."""
+        x, y = self.width_m / 2, self.height_m / 2
+        return np.array([[self.x_m - x, self.y_m - y], [self.x_m + x, self.y_m + y]])
+
+    @property
+    def size_m(self) -> float:
+        """The longer side."""
+        return max(self.width_m, self.height_m)
+
+    @property
+    def eye_m(self) -> float:
+        """How high the eye must be to see it all, with a margin and a scale bar below."""
+        return MARGIN * max(self.height_m, self.width_m / ASPECT) / (2 * math.tan(FIELD_OF_VIEW / 2))
 
     def bar(self) -> tuple[float, tuple[float, float]]:
-        """A round length of at most a quarter of the side, and where a scale bar of it begins (x, y)."""
+        """A round length of at most a quarter of the longer side, and where a scale bar of it begins (x, y)."""
         power = 10.0 ** math.floor(math.log10(self.size_m / 4))
         length = next(n * power for n in (5, 2, 1) if n * power <= self.size_m / 4)
-        return length, (self.x_m - self.size_m / 2, self.y_m - 0.58 * self.size_m)
+        below = self.y_m - self.height_m / 2 - 0.07 * max(self.height_m, self.width_m / ASPECT)
+        return length, (self.x_m - self.width_m / 2, below)
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,14 +113,14 @@ def correlation_blueprint(run: str, estimator: str = "correlation", bounds: Boun
         rrb.Vertical(
             rrb.Horizontal(
                 _image("/camera/image", bounds.image_px, "Image: fragments, search areas, matches",
-                       contents=["/camera/image", f"/camera/image/{run}/**"]),
+                       contents=["/camera/image", f"/camera/image/{run}/**"], hidden=[f"/camera/image/{run}/tiles"]),
                 _image(f"{root}/search/surface", bounds.surfaces_px, "Correlation surfaces"),
                 _map(run, bounds.extent),
             ),
-            rrb.Horizontal(_plots(root, bounds.frames), _texts(run, root), column_shares=[2, 1]),
+            rrb.Horizontal(_plots(root, bounds.frames), _texts(run, root), column_shares=[3, 2]),
             rrb.StateTimelineView(origin=root, contents=[f"{root}/verdict", f"{root}/verdicts/**"], name="Verdicts",
                                   time_view=_axis(bounds.frames)),
-            row_shares=[10, 8, 5],
+            row_shares=[10, 8, 7],
         ),
         *_panels(),
         auto_views=False,
@@ -112,12 +136,20 @@ def _panels() -> Sequence[Any]:
 
 
 def _image(
-    origin: str, size_px: tuple[float, float] | None, name: str, *, contents: Sequence[str] = ("$origin/**",)
+    origin: str,
+    size_px: tuple[float, float] | None,
+    name: str,
+    *,
+    contents: Sequence[str] = ("$origin/**",),
+    hidden: Sequence[str] = (),
 ) -> rrb.Spatial2DView:
     bounds = None
     if size_px is not None and np.isfinite(size_px).all():
         bounds = rrb.VisualBounds2D(x_range=(0.0, size_px[0]), y_range=(0.0, size_px[1]))
-    return rrb.Spatial2DView(origin=origin, contents=list(contents), name=name, visual_bounds=bounds)
+    overrides: dict[Any, Any] = {entity: rrb.EntityBehavior(visible=False) for entity in hidden}
+    return rrb.Spatial2DView(
+        origin=origin, contents=list(contents), name=name, visual_bounds=bounds, overrides=overrides
+    )
 
 
 def _axis(frames: tuple[int, int] | None) -> rrb.TimeAxis:
@@ -134,7 +166,7 @@ def _map(run: str, extent: Extent | None) -> rrb.Spatial3DView:
     eye = None
     if extent is not None:
         eye = rrb.EyeControls3D(
-            position=(extent.x_m, extent.y_m, 1.3 * extent.size_m),
+            position=(extent.x_m, extent.y_m, extent.eye_m),
             look_target=(extent.x_m, extent.y_m, 0.0),
             eye_up=(0.0, 1.0, 0.0),
         )
@@ -148,7 +180,7 @@ def _map(run: str, extent: Extent | None) -> rrb.Spatial3DView:
     return rrb.Spatial3DView(
         origin="/world",
         contents="/world/**",
-        name="From above: reference green, raw grey, corrected blue",
+        name="Map: reference green, raw grey, corrected blue, aligned violet",
         eye_controls=eye,
         overrides=overrides,
         background=[18, 20, 24],
@@ -172,8 +204,8 @@ def _plots(root: str, frames: tuple[int, int] | None) -> rrb.Tabs:
     heading = [place == 8 for place in range(9)]
     return rrb.Tabs(
         rrb.Horizontal(
-            plot("Shift since the frame before, px", "motion/frame_shift"),
-            plot("Shift from the template frame, px", "fit/centre_shift"),
+            plot("Shift since the frame before, px (u blue, v orange)", "motion/frame_shift", legend=False),
+            plot("Shift from the template frame, px (u blue, v orange)", "fit/centre_shift", legend=False),
             name="Shift",
         ),
         rrb.Horizontal(
@@ -187,9 +219,9 @@ def _plots(root: str, frames: tuple[int, int] | None) -> rrb.Tabs:
             name="Δα, α",
         ),
         rrb.Horizontal(
-            plot("Peak correlation", "search/peak_correlation", legend=False),
-            plot("Second peak over first", "search/peak_ratio", legend=False),
-            plot("Residual rms, grey", "subpixel/residual_rms", legend=False),
+            plot("Peak", "search/peak_correlation", legend=False),
+            plot("Second / first", "search/peak_ratio", legend=False),
+            plot("Residual, grey", "subpixel/residual_rms", legend=False),
             plot("Inliers", "fit/inliers", legend=False),
             name="Quality",
         ),
@@ -199,7 +231,12 @@ def _plots(root: str, frames: tuple[int, int] | None) -> rrb.Tabs:
             name="Correction",
         ),
         rrb.Horizontal(
-            plot("Position error, m", "error", show=[True, True, True, False]),
+            plot(
+                "Position error, m (x blue, y orange, distance white)",
+                "error",
+                legend=False,
+                show=[True, True, True, False],
+            ),
             plot("Heading error, rad", "error", legend=False, show=[False, False, False, True]),
             name="Errors",
         ),
@@ -216,7 +253,7 @@ def _texts(run: str, root: str) -> rrb.Tabs:
     return rrb.Tabs(
         rrb.TextDocumentView(origin=f"{root}/numbers", name="Numbers"),
         rrb.TextLogView(origin=f"{root}/events", name="Events", columns=columns),
-        rrb.TextLogView(origin=f"{root}/alarms", name="Every alarm", columns=columns),
+        rrb.TextLogView(origin=f"{root}/alarms", name="Alarms", columns=columns),
         rrb.TextDocumentView(origin=f"/runs/{run}/summary", name="Summary"),
         rrb.TextDocumentView(origin=f"/runs/{run}/settings", name="Settings"),
         rrb.TextDocumentView(origin="/recording/facts", name="Recording"),

@@ -44,14 +44,19 @@ REFERENCE = "/world/reference"
 MAX_ROWS = 1024
 MAX_BYTES = 2 << 20
 MAX_AGE_S = 0.5
-ARROW_SHARE = 0.08
+ARROW_SHARE = 0.1
 """Length of the arrows of heading, in sides of the map."""
+
+LAYER_M = 0.001
+"""Height of each layer of the map over the one below, so that what lies over one another does not flicker."""
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 _LEVELS = {Severity.FINE: "INFO", Severity.NOTICE: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
-_COLOURS = {"reference": 0x2ECC71FF, "raw": 0x9E9E9EFF, "corrected": 0x4FC3F7FF, "aligned": 0xCE93D8FF}
+_COLOURS = {"reference": 0x2ECC71FF, "raw": 0x9E9E9EFF, "corrected": 0x4FC3F7FF, "aligned": 0xCE93D8FF,
+            "arrow": 0xFFFFFFFF}  # fmt: skip
+_LAYERS = ("aligned", "reference", "raw", "corrected", "markers", "arrows")
 
 
 # ---------------------------------------------------------------------------- one file
@@ -139,10 +144,11 @@ def _texts(events: Sequence[traces.Event]) -> rr.ComponentColumnList:
     return rr.TextLog.columns(text=[e.text for e in events], level=[_LEVELS[e.severity] for e in events])
 
 
-def _flat(points: Floats) -> NDArray[np.float32]:
-    """Points [n, 2] on the ground as [n, 3] in the viewer's precision."""
+def _flat(points: Floats, layer: str = "") -> NDArray[np.float32]:
+    """Points [n, 2] on the ground as [n, 3] in the viewer's precision, a hair above the layers below."""
+    z = LAYER_M * (_LAYERS.index(layer) if layer else 0)
     with np.errstate(over="ignore"):
-        return np.column_stack([points, np.zeros(len(points))]).astype(np.float32)
+        return np.column_stack([points, np.full(len(points), z)]).astype(np.float32)
 
 
 def _document(text: str) -> rr.TextDocument:
@@ -261,9 +267,11 @@ class SensorWriter(_Writer):
         self._arrow_m = extent.size_m * ARROW_SHARE
         self._file.scale_bar(extent)
         self._file.blueprint(self._view(Bounds(extent=extent)))
-        path = rr.LineStrips3D([_flat(position[:, :2])], colors=_COLOURS["reference"], radii=rr.Radius.ui_points(1.5))
+        points = _flat(position[:, :2], "reference")
+        path = rr.LineStrips3D([points], colors=_COLOURS["reference"], radii=rr.Radius.ui_points(2.5))
         self._file.static(f"{REFERENCE}/path", path)
-        self._file.static(f"{REFERENCE}/pose", *_marker("reference"))
+        self._file.static(f"{REFERENCE}/pose", _marker("reference", 7))
+        self._file.static(f"{REFERENCE}/heading", _arrow("reference", 3))
         names = ["x [m]", "y [m]", "z [m]", "heading [rad]"]
         self._file.static("/sensors/reference", rr.SeriesLines(names=names))
         values = rr.Scalars.columns(scalars=np.column_stack([position, heading]))
@@ -295,7 +303,7 @@ class SensorWriter(_Writer):
         frames, t_ns = frames[inside], t_ns[inside]
         since, known = (t_ns - at_ns[0]).astype(float), (at_ns - at_ns[0]).astype(float)
         x, y, alpha = (np.interp(since, known, values) for values in (position[:, 0], position[:, 1], heading))
-        points = _flat(np.column_stack([x, y]))
+        points = _flat(np.column_stack([x, y]), "reference")
         self._file.send(f"{REFERENCE}/pose", frames, t_ns, rr.Points3D.columns(positions=points))
         vectors = _flat(self._arrow_m * np.column_stack([np.cos(alpha), np.sin(alpha)]))
         good = np.isfinite(vectors).all(axis=1)
@@ -324,8 +332,12 @@ def _format(pixels: NDArray[Any]) -> rr.components.ImageFormat:
     )
 
 
-def _marker(name: str) -> tuple[rr.AsComponents, ...]:
-    return (rr.Points3D.from_fields(colors=_COLOURS[name], radii=rr.Radius.ui_points(5)),)
+def _marker(name: str, radius: float) -> rr.Points3D:
+    return rr.Points3D.from_fields(colors=_COLOURS[name], radii=rr.Radius.ui_points(radius))
+
+
+def _arrow(name: str, radius: float) -> rr.Arrows3D:
+    return rr.Arrows3D.from_fields(colors=_COLOURS[name], radii=rr.Radius.ui_points(radius))
 
 
 # -------------------------------------------------------------------------------- runs
@@ -341,7 +353,7 @@ class RunWriter(_Writer):
         estimator: name of the estimator, likewise.
         step_type: class of the steps; it needs a schema.
         settings_text: the settings as they are saved beside the result.
-        extent: what of the ground the map shows until the run's own path is known, such as the reference's.
+        ground: points [n, 2] in m that the map shows beside the run's own path, such as the reference's.
 
     Raises:
         WorkbenchError: Rerun is switched off, or the Step class has no schema.
@@ -357,7 +369,7 @@ class RunWriter(_Writer):
         estimator: str,
         step_type: type[Step],
         settings_text: str,
-        extent: Extent | None = None,
+        ground: Floats | None = None,
     ) -> None:
         self._schema = schema_of(step_type)
         self._run, self._estimator = run, estimator
@@ -373,8 +385,7 @@ class RunWriter(_Writer):
         self._arrangement: bytes | None = None
         self._file.static(f"/runs/{run}/settings", rr.TextDocument(settings_text, media_type="text/plain"))
         self._constants()
-        self._bounds = Bounds(extent=extent)
-        self._view()
+        self._bounds = Bounds(extent=None if ground is None else Extent.of(ground))
 
     def step(self, step: Step) -> None:
         """Log one step."""
@@ -393,22 +404,24 @@ class RunWriter(_Writer):
 
     def errors(self, frames: Ints, t_ns: Ints, values: Floats) -> None:
         """Log the errors against the reference: x, y, distance (m), heading (rad) [n, 4] at frames and times [n]."""
-        self._file.static(
-            f"{self._root}/error", rr.SeriesLines(names=["x [m]", "y [m]", "distance [m]", "heading [rad]"])
-        )
+        names = ["x [m]", "y [m]", "distance [m]", "heading [rad]"]
+        colours = np.array([0x42A5F5FF, 0xFFB74DFF, 0xFFFFFFFF, 0x42A5F5FF], np.uint32)
+        self._file.static(f"{self._root}/error", rr.SeriesLines(names=names, colors=colours))
         columns = rr.Scalars.columns(scalars=np.asarray(values, np.float64))
         self._file.send(f"{self._root}/error", np.asarray(frames, np.int64), np.asarray(t_ns, np.int64), columns)
 
     def finish(self, summary: Mapping[str, str | float | int], aligned_path: Floats | None) -> None:
         """Log what is known at the end: the summary, the whole path, and the path [n, 2] aligned with the reference."""
         self.flush()
-        rows = "\n".join(f"| {key} | {_number(value)} |" for key, value in summary.items())
-        self._file.static(f"/runs/{self._run}/summary", _document(f"| | |\n|---|---|\n{rows}"))
+        rows = "\n\n".join(f"**{key}** – {_number(value)}" for key, value in summary.items())
+        self._file.static(f"/runs/{self._run}/summary", _document(rows))
         if aligned_path is not None and len(aligned_path):
             self._line("aligned", aligned_path)
         if self._path:
             frames, t_ns, raw, pose = (np.concatenate(column) for column in zip(*self._path, strict=True))
             self._finish_path(frames, t_ns, raw, pose)
+        else:
+            self._view()
 
     # ---- what is logged once
 
@@ -423,6 +436,7 @@ class RunWriter(_Writer):
         self._file.static(f"{image}/fragments", rr.Boxes2D.from_fields(colors=0xFFFFFFB0, radii=thin, draw_order=11))
         self._file.static(f"{image}/search", rr.Boxes2D.from_fields(colors=0x4FC3F7FF, radii=thin, draw_order=10))
         self._file.static(f"{image}/matches", rr.Boxes2D.from_fields(radii=thick, draw_order=12))
+        self._file.static(f"{image}/tiles", rr.Points2D.from_fields(radii=rr.Radius.ui_points(2), draw_order=14))
         self._file.static(f"{image}/shifts", rr.Arrows2D.from_fields(radii=thick, draw_order=13))
         surface = f"{self._root}/{self._schema.entity('surface')}"
         self._file.static(
@@ -437,9 +451,10 @@ class RunWriter(_Writer):
         labels = rr.Points2D.from_fields(colors=0xFFFFFFFF, radii=rr.Radius.ui_points(0), show_labels=True)
         self._file.static(f"{surface}/labels", labels)
         for name in ("raw", "corrected"):
-            self._file.static(f"{self._world}/{name}", rr.Points3D.from_fields(radii=rr.Radius.ui_points(1.5)))
+            self._file.static(f"{self._world}/{name}", rr.Points3D.from_fields(radii=rr.Radius.ui_points(2)))
         self._file.static(f"{self._world}/raw", rr.Points3D.from_fields(colors=_COLOURS["raw"]))
-        self._file.static(f"{self._world}/body", *_marker("corrected"))
+        self._file.static(f"{self._world}/body", _marker("corrected", 4.5))
+        self._file.static(f"{self._world}/heading", _arrow("arrow", 1.5))
         self._file.static(
             f"{self._world}/covariance",
             rr.Ellipsoids3D.from_fields(
@@ -451,8 +466,9 @@ class RunWriter(_Writer):
         """Log the names of the series, which depend on the number of fragments."""
         table = traces.columns(self._schema, [step])
         for entity, values in traces.scalar_groups(self._schema, table):
-            names, colours = zip(*self._schema.series(entity, values.shape[1]), strict=True)
-            lines = rr.SeriesLines(names=names, colors=np.array(colours, np.uint32))
+            series = self._schema.series(entity, values.shape[1])
+            colours = np.array([one.colour for one in series], np.uint32)
+            lines = rr.SeriesLines(names=[one.name for one in series], colors=colours)
             self._file.static(f"{self._root}/{entity}", lines)
         labels = [str(k + 1) for k in range(table["fragment_px"].shape[1])]
         self._file.static(f"{IMAGE}/{self._run}/fragments", rr.Boxes2D.from_fields(labels=labels))
@@ -485,7 +501,8 @@ class RunWriter(_Writer):
 
     def _values(self, table: traces.Columns) -> None:
         for entity, values in traces.scalar_groups(self._schema, table):
-            self._send(entity, table, rr.Scalars.columns(scalars=values))
+            counts = np.full(len(values), values.shape[1])
+            self._send(entity, table, rr.Scalars.columns(scalars=values.ravel()).partition(counts))
         for entity, rows in self._schema.of(Archetype.INTEGERS).items():
             integers = {row.field: table[row.field] for row in rows}
             self._send(entity, table, rr.DynamicArchetype.columns(Archetype.INTEGERS.value, components=integers))
@@ -515,20 +532,22 @@ class RunWriter(_Writer):
     def _overlays(self, table: traces.Columns) -> None:
         for name, drawn in traces.overlays(table).items():
             colours: dict[str, Any] = {} if drawn.colours is None else {"colors": drawn.colours}
-            columns = (
-                rr.Arrows2D.columns(origins=drawn.points, vectors=drawn.extents, **colours)
-                if name == "shifts"
-                else rr.Boxes2D.columns(centers=drawn.points, half_sizes=drawn.extents, **colours)
-            )
+            match name:
+                case "shifts":
+                    columns = rr.Arrows2D.columns(origins=drawn.points, vectors=drawn.extents, **colours)
+                case "tiles":
+                    columns = rr.Points2D.columns(positions=drawn.points, **colours)
+                case _:
+                    columns = rr.Boxes2D.columns(centers=drawn.points, half_sizes=drawn.extents, **colours)
             self._send(f"{IMAGE}/{self._run}/{name}", table, columns.partition(drawn.counts))
 
     def _map(self, table: traces.Columns) -> None:
         raw, pose = table["pose_raw"], table["pose"]
         colours = traces.verdict_colours(table["verdict"], _COLOURS["corrected"])
-        at = _flat(pose[:, :2])
-        self._send(f"{self._world}/raw", table, rr.Points3D.columns(positions=_flat(raw[:, :2])))
+        at, on_top = (_flat(pose[:, :2], layer) for layer in ("corrected", "markers"))
+        self._send(f"{self._world}/raw", table, rr.Points3D.columns(positions=_flat(raw[:, :2], "raw")))
         self._send(f"{self._world}/corrected", table, rr.Points3D.columns(positions=at, colors=colours))
-        self._send(f"{self._world}/body", table, rr.Points3D.columns(positions=at))
+        self._send(f"{self._world}/body", table, rr.Points3D.columns(positions=on_top))
         half, angle = traces.ellipses(table["pose_covariance"])
         turn = np.column_stack([np.zeros((len(at), 2)), np.sin(angle / 2), np.cos(angle / 2)])
         columns = rr.Ellipsoids3D.columns(half_sizes=_flat(np.nan_to_num(half)), centers=at, quaternions=turn)
@@ -549,8 +568,8 @@ class RunWriter(_Writer):
             self._alarm_lanes(int(table["frame"][row]), int(table["t_ns"][row]), alarms)
 
     def _alarm_lanes(self, frame: int, t_ns: int, alarms: Verdict) -> None:
-        """One lane for every alarm that ever rang."""
-        for flag in Verdict:
+        """One lane for every alarm that ever rang; the first frame of every run needs none."""
+        for flag in (flag for flag in Verdict if flag is not Verdict.FIRST_FRAME):
             rings = flag in alarms
             if rings == self._lanes.get(flag, False):
                 continue
@@ -571,21 +590,18 @@ class RunWriter(_Writer):
 
     def _line(self, name: str, points: Floats) -> None:
         finite = points[np.isfinite(points).all(axis=1)]
-        line = rr.LineStrips3D([_flat(finite)], colors=_COLOURS[name], radii=rr.Radius.ui_points(1.0))
+        line = rr.LineStrips3D([_flat(finite, name)], colors=_COLOURS[name], radii=rr.Radius.ui_points(0.6))
         self._file.static(f"{self._world}/path/{name}", line)
 
     def _finish_path(self, frames: Ints, t_ns: Ints, raw: Floats, pose: Floats) -> None:
         self._line("raw", raw[:, :2])
         self._line("corrected", pose[:, :2])
-        extent = Extent.of(pose[:, :2])
+        given = self._bounds.extent
+        extent = Extent.of(np.concatenate([pose[:, :2], *([] if given is None else [given.corners])]))
         good = np.isfinite(pose).all(axis=1)
         self._file.scale_bar(extent)
         vectors = ARROW_SHARE * extent.size_m * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
-        arrows = rr.Arrows3D.columns(vectors=_flat(vectors[good]), origins=_flat(pose[good, :2]))
-        self._file.static(
-            f"{self._world}/heading",
-            rr.Arrows3D.from_fields(colors=0xFFFFFFFF, radii=rr.Radius.ui_points(1.5)),
-        )
+        arrows = rr.Arrows3D.columns(vectors=_flat(vectors[good]), origins=_flat(pose[good, :2], "arrows"))
         self._file.send(f"{self._world}/heading", frames[good], t_ns[good], arrows)
         self._view(frames=(int(frames.min()), int(frames.max())), extent=extent)
 
@@ -605,7 +621,8 @@ def _number(value: str | float | int) -> str:
 def read_steps(path: Path | str, run: str, step_type: type[Step]) -> list[Step]:
     """The Steps of a run, from a finished file or from what a killed process left.
 
-    Every number is exactly the one that was logged, surfaces within the step of float16.
+    Every number is exactly the one that was logged, surfaces within the step of float16. All steps stand in
+    memory at once, about 25 kB each with nine surfaces: of a long run, take single fields with `read_fields`.
 
     Raises:
         RecordingError: the file cannot be read, or holds no such run.

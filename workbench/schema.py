@@ -180,6 +180,8 @@ CORRELATION = Schema(
         Row("iterations", "subpixel/iterations", title="iterations"),
         Row("gain", "subpixel/gain", title="gain"),
         Row("offset", "subpixel/offset", title="offset"),
+        Row("match_grey", "subpixel/match_grey", title="mean grey"),
+        Row("gradient", "subpixel/gradient", title="gradient"),
         Row("residual_rms", "subpixel/residual_rms", title="residual", also=_TABLE),
         Row("sigma_px", "subpixel/sigma", axes=_UV, title="σ"),
         Row("shift_px", "subpixel/shift", axes=_UV, title="shift", also="arrows and boxes on the image"),
@@ -190,6 +192,9 @@ CORRELATION = Schema(
         Row("scale", "fit/scale", title="scale"),
         Row("centre_shift_px", "fit/centre_shift", axes=_UV, title="from the template"),
         Row("template_rotation_rad", "fit/rotation", title="from the template"),
+        Row("tile_px", "fit/tiles/centre", axes=_UV, title="tile"),
+        Row("tile_shift_px", "fit/tiles/shift", axes=_UV, title="tile shift", also="points `/camera/image/RUN/tiles`"),
+        Row("tile_weight", "fit/tiles/weight", title="tile weight", also="colour of these points"),
         Row("motion_covariance", "fit/covariance", axes=("uu", "uv", "uα", "vu", "vv", "vα", "αu", "αv", "αα"),
             title="motion P", also=_TABLE),
         Row("frame_shift_px", "motion/frame_shift", axes=_UV, title="since the frame before"),
@@ -248,7 +253,7 @@ This page is made by `python -m workbench.schema`; a test demands that it is cur
 | Entity | What |
 |---|---|
 | `/runs/RUN/settings`, `/runs/RUN/summary` | settings, and what was found at the end |
-| `/runs/RUN/ESTIMATOR/verdict`, `/verdicts/NAME` | state lanes: the verdict, and each alarm that ever rang |
+| `/runs/RUN/ESTIMATOR/verdict`, `/verdicts/NAME` | lanes: the verdict, each alarm that ever rang (save FIRST_FRAME) |
 | `/runs/RUN/ESTIMATOR/events` | log of where the verdict changed, and of what the replay met |
 | `/runs/RUN/ESTIMATOR/alarms` | log of every frame with an alarm |
 | `/runs/RUN/ESTIMATOR/numbers` | matrices and fragments of the frame as tables |
@@ -257,6 +262,7 @@ This page is made by `python -m workbench.schema`; a test demands that it is cur
 | `/world/runs/RUN/body`, `/heading`, `/covariance` | where it is now, with the 3σ ellipse of the position |
 | `/world/runs/RUN/path/NAME` | the whole path, raw, corrected and aligned with the reference |
 | `/camera/image/RUN/fragments`, `/search`, `/matches`, `/shifts` | drawn on the image |
+| `/camera/image/RUN/tiles` | where the photometric tiles were found; hidden until it is switched on |
 """
 
 

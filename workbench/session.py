@@ -130,8 +130,8 @@ class Writers(NamedTuple):
     """What makes the writers of the two kinds of files.
 
     Both are called with the file and, by name, the `recording_id`, the `run`, the name of its `estimator` and its
-    `step_type`; `sensors` with `raw_images` as well, `run` with `settings_text` and the positions of the reference,
-    `reference_xy` [n, 2] in m (none where the path is not in metres).
+    `step_type`; `sensors` with `raw_images` as well, `run` with `settings_text` and `ground` [n, 2], positions of
+    the reference in m that the map shows (None where there are none, or the path is not in metres).
     """
 
     sensors: Callable[..., SensorLog]
@@ -140,16 +140,13 @@ class Writers(NamedTuple):
 
 def rerun_writers() -> Writers:
     """The writers of Rerun recordings; both files bring the view of the run along, whichever is opened last."""
-    from workbench.blueprints import Extent, blueprint_of
+    from workbench.blueprints import blueprint_of
     from workbench.rrd import RunWriter, SensorWriter
 
     def sensors(file: Path, *, run: str, estimator: str, step_type: type[Step], **options: Any) -> SensorLog:
         return SensorWriter(file, view=partial(blueprint_of, step_type, run, estimator), **options)
 
-    def run(file: Path, *, reference_xy: Floats, **options: Any) -> RunLog:
-        return RunWriter(file, extent=Extent.of(reference_xy) if len(reference_xy) else None, **options)
-
-    return Writers(sensors, run)
+    return Writers(sensors, RunWriter)
 
 
 # ------------------------------------------------------------------------------ interrupt
@@ -494,9 +491,17 @@ class _Session:
             if stopped:
                 run.event(frame, t_ns, Severity.ERROR, stopped)
         if sensors is not None:
-            sensors.facts([*self.notes, *(f"damage: {text}" for text in damage), *facts])
+            oddities = [*(f"damage: {text}" for text in damage), *facts]
+            sensors.facts([*self._contents(), *self.notes, *(oddities or ["nothing odd was met"])])
         run.finish(_flat(lines(summary)), aligned)
         return summary
+
+    def _contents(self) -> Iterator[str]:
+        """The recording and its streams, one line each."""
+        yield f"**{self.request.path.name}** ({self.recording.format})"
+        for stream in self.recording.streams:
+            count = f", {stream.count} messages" if stream.count >= 0 else ""
+            yield f"`{stream.name}`: {stream.kind}{count}"
 
     def _evaluate(self, estimate: Trajectory) -> tuple[Evaluation | None, str]:
         """The evaluation, or why there is none."""
@@ -584,7 +589,7 @@ class _Session:
             estimator=self.estimator.name,
             step_type=self.estimator.step_type,
             settings_text=to_toml(settings_values(self.estimator.settings)),
-            reference_xy=self.reference.path.pose[:, :2] if self.scale.known else np.empty((0, 2)),
+            ground=self.reference.path.pose[:, :2] if self.reference.poses and self.scale.known else None,
         )
 
     @property

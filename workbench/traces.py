@@ -169,7 +169,7 @@ def mosaics(table: Columns) -> Iterator[Mosaics]:
 class Shapes(NamedTuple):
     """Shapes of n steps one after another: `counts` [n] of them belong to each step.
 
-    `points` [N, 2], `extents` [N, 2] (half sizes of boxes, vectors of arrows), `colours` [N].
+    `points` [N, 2], `extents` [N, 2] (half sizes of boxes, vectors of arrows, unused for points), `colours` [N].
     """
 
     counts: Ints
@@ -199,17 +199,19 @@ def weight_colours(weight: Floats, accepted: NDArray[Any]) -> Colours:
 
 
 def overlays(table: Columns) -> dict[str, Shapes]:
-    """Boxes and arrows on the image: `fragments`, `search`, `matches`, `shifts`."""
+    """Boxes, arrows and points on the image: `fragments`, `search`, `matches`, `shifts`, `tiles`."""
     at = table["fragment_px"] + 0.5
     n = len(at)
     half = np.broadcast_to(table["fragment_side_px"].reshape(n, 1, 1) / 2.0, at.shape)
     reach = half + table["search_radius_px"].reshape(n, 1, 1)
     colours = weight_colours(table["weight"], table["accepted"])
+    tiles = table["tile_px"] + table["tile_shift_px"] + 0.5
     return {
         "fragments": shapes(at, half),
         "search": shapes(table["search_centre_px"] + 0.5, reach),
         "matches": shapes(at + table["shift_px"], half, colours),
         "shifts": shapes(at, table["shift_px"], colours),
+        "tiles": shapes(tiles, tiles, weight_colours(table["tile_weight"], table["accepted"])),
     }
 
 
@@ -308,7 +310,9 @@ class Changes:
         if verdict != Verdict.OK:
             yield Event(row, verdict.severity, f"{verdict.name}: {verdict.sentence}")
         elif self._verdict is not None and self._verdict.severity > Severity.NOTICE:
-            yield Event(row, Severity.FINE, f"OK again: {self._verdict.name} lasted {frame - self._since} frames")
+            count = frame - self._since
+            frames = f"{count} frame" + "s" * (count != 1)
+            yield Event(row, Severity.FINE, f"OK again after {frames} of {self._verdict.name}")
 
 
 def verdict_lines(table: Columns) -> list[Event]:
