@@ -131,6 +131,12 @@ def test_some_fields_read_back_alone(tmp_path: Path) -> None:
     assert read["frame"] == list(range(20))
     np.testing.assert_array_equal(read["pose"], [step.pose for step in steps])
     np.testing.assert_array_equal(read["verdict"], [step.verdict for step in steps])
+    table = rrd.read_table(path, "best", CorrelationStep, ["pose", "inliers", "shift_px"])
+    assert table.index.name == "frame"
+    assert list(table.columns[:4]) == ["pose[0]", "pose[1]", "pose[2]", "inliers"]
+    for step in steps:
+        assert table.loc[step.frame, "pose[2]"] == step.pose[2]
+        np.testing.assert_array_equal(table.loc[step.frame, "shift_px[1,0]"], step.shift_px[1, 0])
 
 
 def test_a_step_whose_fragments_change_reads_back(tmp_path: Path) -> None:

@@ -20,7 +20,7 @@ import warnings
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Literal, Self
+from typing import TYPE_CHECKING, Any, Literal, Self
 
 import cv2
 import numpy as np
@@ -36,6 +36,9 @@ from readers.streams import ImageError, ImageSample, PoseSample, RecordingError,
 from workbench import traces
 from workbench.blueprints import Bounds, Extent, blueprint_of, sensor_blueprint
 from workbench.schema import Archetype, Row, Schema, schema_of
+
+if TYPE_CHECKING:
+    import pandas as pd
 
 APPLICATION = "estimator_workbench"
 IMAGE = "/camera/image"
@@ -659,6 +662,28 @@ def read_fields(path: Path | str, run: str, step_type: type[Step], fields: Itera
             formats = rows[row.entity, _FORMAT][2]
             table[row.field] = _surfaces(rows[row.entity, row.component][2], formats, table)
     return {field: table[field] for field in wanted}
+
+
+def read_table(path: Path | str, run: str, step_type: type[Step], fields: Iterable[str]) -> pd.DataFrame:
+    """Some fields of a run's steps as a table with one row per frame, the frame's number as its index.
+
+    A field of one number is a column of its name, an element of an array one named like ``pose[0]`` or
+    ``shift_px[3,1]``.
+
+    Raises:
+        RecordingError: the file cannot be read, or holds no such run.
+    """
+    import pandas as pd
+
+    values = read_fields(path, run, step_type, ["frame", *fields])
+    frames = values.pop("frame")
+    columns: dict[str, Any] = {}
+    for field, items in values.items():
+        array = np.asarray(items)
+        for index in np.ndindex(array.shape[1:]):
+            name = f"{field}[{','.join(map(str, index))}]" if index else field
+            columns[name] = array[(slice(None), *index)]
+    return pd.DataFrame(columns, index=pd.Index(frames, name="frame"))
 
 
 _FORMAT = "DepthImage:format"
