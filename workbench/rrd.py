@@ -7,6 +7,7 @@ footer, keep about half a second in memory, and put nothing of the wall clock in
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import functools
 import hashlib
@@ -158,7 +159,7 @@ def _document(text: str) -> rr.TextDocument:
     return rr.TextDocument(text, media_type="text/markdown")
 
 
-class _Writer:
+class _Writer(abc.ABC):
     """What both writers share: the file, the age of the buffer, and an orderly end."""
 
     def __init__(self, path: Path | str, recording_id: str) -> None:
@@ -191,8 +192,9 @@ class _Writer:
         if full or time.monotonic() - self._sent > MAX_AGE_S:
             self.flush()
 
+    @abc.abstractmethod
     def _write(self) -> None:
-        raise NotImplementedError
+        """Send what is buffered as columns."""
 
 
 # ----------------------------------------------------------------------------- sensors
