@@ -316,26 +316,34 @@ def test_a5_a6_accuracy_of_the_refinement(
     gravel: Surface, side: int, gain_and_offset: bool, compensated: float, plain: float
 ) -> None:
     errors = Errors(gravel, side, 0.44, pairs=60 if side == 9 else 20)
-    assert rms_of(errors.iterated(0.44 * DEGREE, gain_and_offset)) <= compensated
-    assert rms_of(errors.iterated(0.0, gain_and_offset)) <= plain
+    rms = [rms_of(errors.iterated(turn, gain_and_offset)) for turn in (0.44 * DEGREE, 0.0)]
+    print(f"A5, A6 side {side}: rms px compensated, plain", *rms)
+    assert rms[0] <= compensated
+    assert rms[1] <= plain
 
 
 def test_a7_s_curves(gravel: Surface) -> None:
     errors = Errors(gravel, 21, 0.44, pairs=24)
-    assert abs(s_curve_of(errors.iterated(0.44 * DEGREE))) <= 0.006
-    assert s_curve_of(errors.one_step()) == pytest.approx(0.028, abs=0.007)
+    curves = s_curve_of(errors.iterated(0.44 * DEGREE)), s_curve_of(errors.one_step())
+    print("A7 S-curves px: best, paper-a", *curves)
+    assert abs(curves[0]) <= 0.006
+    assert curves[1] == pytest.approx(0.028, abs=0.007)
 
 
 def test_a8_large_rotation(gravel: Surface) -> None:
     errors = Errors(gravel, 21, 2.5, pairs=10)
-    assert rms_of(errors.iterated(2.5 * DEGREE)) <= 0.020
+    rms = rms_of(errors.iterated(2.5 * DEGREE))
+    print("A8 rms px", rms)
+    assert rms <= 0.020
     assert rms_of(errors.iterated(0.0)) > 0.05  # what compensation is for
 
 
 @pytest.mark.parametrize(("side", "bar"), [(9, 0.065), (21, 0.032)])
 def test_a9_exposure(gravel: Surface, side: int, bar: float) -> None:
     errors = Errors(gravel, side, 0.44, pairs=10, gain=1.15)
-    assert rms_of(errors.iterated(0.44 * DEGREE)) <= bar
+    rms = rms_of(errors.iterated(0.44 * DEGREE))
+    print(f"A9 side {side}: rms px", rms)
+    assert rms <= bar
     assert rms_of(errors.iterated(0.44 * DEGREE, gain_and_offset=False)) > bar
 
 
@@ -345,4 +353,6 @@ def test_a9_exposure(gravel: Surface, side: int, bar: float) -> None:
 )
 def test_a10_false_peaks(name: str, side: int, low: float, high: float) -> None:
     errors = Errors(surface_of(name), side, 0.44, pairs=20)
-    assert low <= false_peaks_of(errors.one_step()) <= high
+    false = false_peaks_of(errors.one_step())
+    print(f"A10 {name} side {side}: false peaks", false)
+    assert low <= false <= high
