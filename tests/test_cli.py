@@ -548,7 +548,7 @@ def test_inspect_lists_streams_oddities_and_damage(toys: Path, shell: Shell, mon
     monkeypatch.setattr(readers.clock, "survey", lambda recording, progress=None: (fact,), raising=False)
     Path("walk-damaged-camera.log").touch()
     said = shell("inspect", "walk-damaged-camera.log")
-    assert said.status == 0
+    assert said.status == 3
     rows = said.out.splitlines()
     assert rows[0] == "walk-damaged-camera.log: toy"
     assert rows[1] == "from 2023-11-14 22:13:20.000 UTC for 3.900 s (log time)"

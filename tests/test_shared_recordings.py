@@ -1,7 +1,6 @@
 """What becomes of every file and folder that others recorded: it opens with these streams, or one line refuses it."""
 
 import json
-import time
 from pathlib import Path
 from typing import NamedTuple
 
@@ -194,8 +193,7 @@ def test_the_outcomes_are_of_all_recordings_that_there_are() -> None:
     assert not unnamed
 
 
-def test_inspecting_all_of_them_takes_under_a_minute_and_never_faults(capsys: pytest.CaptureFixture[str]) -> None:
-    began = time.monotonic()
+def test_inspecting_all_of_them_never_faults(capsys: pytest.CaptureFixture[str]) -> None:
     for name, outcome in OUTCOMES.items():
         words = ["inspect", str(RECORDINGS / name), "--json"]
         rate = outcome.rate_hz if isinstance(outcome, Opens) else None
@@ -206,6 +204,12 @@ def test_inspecting_all_of_them_takes_under_a_minute_and_never_faults(capsys: py
             assert said.out == ""
             assert_one_line(said.err.removesuffix("\n"), name, outcome.words)
         else:
-            assert (status, said.err) == (0, ""), name
-            assert len(json.loads(said.out)["streams"]) == len(outcome.readable) + outcome.listed
-    assert time.monotonic() - began < 60
+            values = json.loads(said.out)
+            assert (status, said.err) == (3 if values["damage"] else 0, ""), name
+            assert len(values["streams"]) == len(outcome.readable) + outcome.listed
+
+
+def test_unknown_types_are_listed_with_their_definition(capsys: pytest.CaptureFixture[str]) -> None:
+    main(["inspect", str(RECORDINGS / "ros1_custom_types" / "tilt_laser.bag"), "--quick"])
+    said = capsys.readouterr().out
+    assert "no reader for type xsens_mtig/Thermistor, its definition: Header header; float32 reading;" in said

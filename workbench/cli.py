@@ -108,6 +108,8 @@ def inspect(
             _print_json(values)
         else:
             _print_recording(recording, values)
+        if values["damage"]:
+            raise typer.Exit(IN_PART)
 
 
 def _survey(recording: Recording) -> list[dict[str, Any]]:
@@ -145,6 +147,7 @@ def _stream_values(info: StreamInfo) -> dict[str, Any]:
         "frame": info.frame,
         "readable": info.readable,
         "reason": info.reason,
+        "definition": info.definition,
     }
 
 
@@ -175,9 +178,16 @@ def _print_recording(recording: Recording, values: Mapping[str, Any]) -> None:
     for name, camera in recording.cameras.items():
         print(f"\ncamera of {shown(name)}: {_camera_text(camera)}")
     _print_list("notes", values["notes"])
-    _print_list("not readable", [f"{i.name}: {i.reason}" for i in recording.streams if not i.readable])
+    _print_list("not readable", [_unreadable(info) for info in recording.streams if not info.readable])
     _print_list("damage", values["damage"])
     _print_list("oddities", [f"{fact['stream']}: {fact['sentence']}" for fact in values["facts"]])
+
+
+def _unreadable(info: StreamInfo) -> str:
+    """Why a stream cannot be read, and the fields of its messages in a line (`--json` has the whole definition)."""
+    lines = [line.partition("#")[0].strip() for line in info.definition.partition("\n====")[0].splitlines()]
+    fields = "; ".join(" ".join(line.split()) for line in lines if line)
+    return f"{info.name}: {info.reason}" + (f", its definition: {fields}" if fields else "")
 
 
 def _stream_row(info: StreamInfo, origin_ns: int) -> tuple[str, ...]:
@@ -309,7 +319,7 @@ def _status(outcome: Outcome) -> int:
     if calibration is not None and not calibration["key"]:
         _error(f"--calibrate: {calibration['sentence']}")
         return REFUSED
-    return 0
+    return IN_PART if summary["damage"] else 0
 
 
 def _files(outcome: Outcome) -> list[str]:
