@@ -11,6 +11,8 @@ import pytest
 from numpy.typing import NDArray
 from recordings_dir import RECORDINGS
 
+from pipelines.correlation.equations import Motion
+from pipelines.correlation.matching import Matcher
 from pipelines.correlation.odometry import CorrelationOdometry, CorrelationState
 from pipelines.correlation.settings import CorrelationSettings
 from pipelines.correlation.step import CorrelationStep
@@ -464,6 +466,21 @@ def test_jump_beyond_the_search_is_found_globally() -> None:
     assert result.distance_m[-1] < 5e-4
     lost = drive.run(settings("best", recovery=False))
     assert lost.distance_m[-1] > 0.05
+
+
+def test_the_global_search_prefers_the_period_that_was_predicted() -> None:
+    v, u = np.mgrid[0:512, 0:512]
+
+    def lattice(shift: int) -> NDArray[np.uint8]:
+        scene = np.sign(np.sin((u - shift) * np.pi / 32) * np.sin(v * np.pi / 32))
+        noise = np.random.default_rng(shift).normal(0, 3, scene.shape)
+        return np.clip(cv2.GaussianBlur(120 + 50 * scene, (0, 0), 2) + noise, 0, 255).astype(np.uint8)
+
+    matcher = Matcher(settings("best", recovery_rotations_rad=(0.0,)))
+    for predicted in (0.0, 64.0, -64.0):
+        (motion,) = matcher.search_globally(lattice(0), lattice(12), Motion(predicted + 8.0, 0.0, 0.0))
+        assert motion.u == pytest.approx(predicted + 12.0, abs=4.0)
+        assert motion.v == pytest.approx(0.0, abs=4.0)
 
 
 def test_loss_is_held_marked_and_bridged() -> None:

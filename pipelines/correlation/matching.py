@@ -284,10 +284,11 @@ class Matcher:
                 break
         return whole, shift, whole.weight
 
-    def search_globally(self, template: Grey, grey: Grey) -> list[Motion]:
+    def search_globally(self, template: Grey, grey: Grey, predicted: Motion) -> list[Motion]:
         """Motions that a patch of the template's centre proposes over the whole frame, the best first.
 
-        Works on images reduced by `GLOBAL_REDUCTION`, at each of `recovery_rotations_rad`.
+        Works on images reduced by `GLOBAL_REDUCTION`, at each of `recovery_rotations_rad`; of peaks that differ by
+        less than `ambiguity` the one nearest to the predicted motion counts.
         """
         s = self._s
         height, width = (n // GLOBAL_REDUCTION for n in grey.shape)
@@ -307,7 +308,11 @@ class Matcher:
             if float(patch.std()) < 1.0:
                 continue
             surface = cv2.matchTemplate(small, patch, cv2.TM_CCOEFF_NORMED)
-            _, value, _, (i, j) = cv2.minMaxLoc(surface)
+            value = float(surface.max())
+            rivals = (surface >= value - s.ambiguity) & (surface >= cv2.dilate(surface, np.ones((3, 3), np.uint8)))
+            places = np.argwhere(rivals)
+            expected = np.array([predicted.v / GLOBAL_REDUCTION + top, predicted.u / GLOBAL_REDUCTION + left])
+            j, i = places[np.argmin(((places - expected) ** 2).sum(axis=1))].tolist()
             if value >= s.global_min_correlation:
                 motion = Motion((i - left) * GLOBAL_REDUCTION, (j - top) * GLOBAL_REDUCTION, rotation)
                 found.append((-value, motion))

@@ -32,6 +32,10 @@ Grey = NDArray[np.uint8]
 Pose = tuple[float, float, float]
 
 
+JITTER = 0.6
+"""Intervals below this share of the usual one are taken for jitter of the stamps."""
+
+
 class Segment(NamedTuple):
     """A correction segment: frames and sums so far, deviations at its end, what is applied and what is due."""
 
@@ -199,7 +203,7 @@ class CorrelationOdometry:
             previous_ns=sample.t_ns,
             relative=relative,
             velocity=motion if accepted else state.velocity,
-            velocity_s=dt_s if accepted else state.velocity_s,
+            velocity_s=_motion_time(state, dt_s) if accepted else state.velocity_s,
             last_shift=candidate.matches.peak_px if accepted else None,
             inliers=candidate.inliers if accepted else state.inliers,
             lost_frames=0 if accepted else state.lost_frames + 1,
@@ -234,17 +238,19 @@ class CorrelationOdometry:
         if not s.recovery:
             return first, 0
         starting = state.velocity is None
-        if first.acceptable and not (starting and first.alarms & Verdict.PEAK_AT_BORDER):
+        if _convincing(first) and not (starting and first.alarms & Verdict.PEAK_AT_BORDER):
             return first, 0
-        bases = [(template, None)] if template.frame == previous.frame else [(template, None), (previous, step)]
+        bases = [(template, predicted)]
+        if template.frame != previous.frame:
+            bases.append((previous, step))
         for base, prediction in bases:
-            if prediction is not None:
+            if base is not template:
                 candidate = self._matcher.match(base, grey, prediction, usual_residual=usual)
-                if candidate.acceptable:
+                if _convincing(candidate):
                     return candidate, 0
-            for motion in self._matcher.search_globally(base.grey, grey):
+            for motion in self._matcher.search_globally(base.grey, grey, prediction):
                 candidate = self._matcher.match(base, grey, motion, usual_residual=usual)
-                if candidate.acceptable:
+                if _convincing(candidate):
                     return candidate, 0 if starting else int(Verdict.REACQUIRED)
         return first, 0
 
@@ -269,7 +275,7 @@ class CorrelationOdometry:
 
     def _held(self, state: CorrelationState, dt_s: float) -> Motion:
         """The motion since the last frame at the last measured velocity; still where there is none."""
-        return STILL if state.velocity is None else state.velocity.times(dt_s / state.velocity_s)
+        return STILL if state.velocity is None else state.velocity.times(_motion_time(state, dt_s) / state.velocity_s)
 
     def _motion_between_frames(
         self, state: CorrelationState, candidate: Candidate, dt_s: float
@@ -511,6 +517,17 @@ def eight_bit(grey: NDArray[np.uint8] | NDArray[np.uint16]) -> Grey:
     fixed = np.ascontiguousarray(eight, np.uint8).view()
     fixed.setflags(write=False)  # compiled code is built for one kind of array
     return fixed
+
+
+def _motion_time(state: CorrelationState, dt_s: float) -> float:
+    """The time that counts for a velocity, s: stamps much closer than the usual are jitter."""
+    usual_s = state.usual.interval_s
+    return max(dt_s, JITTER * usual_s) if usual_s == usual_s else dt_s
+
+
+def _convincing(candidate: Candidate) -> bool:
+    """Whether at least half of the fragments agree; fewer can agree by chance, wherever one looks."""
+    return candidate.acceptable and 2 * candidate.inliers >= len(candidate.search)
 
 
 def _frame_of(state: CorrelationState, sample: ImageSample) -> int:
