@@ -7,6 +7,7 @@ import pytest
 
 from pipelines.correlation import equations as eq
 from pipelines.correlation.equations import Motion
+from pipelines.correlation.kernels import shifts_of
 from pipelines.simulation import trajectories as way
 
 W = 0.2002 / 256
@@ -72,7 +73,7 @@ def test_integration_by_length_loses_the_lever() -> None:
 
 def test_two_fragments_give_the_motion_of_the_frame() -> None:
     motion = Motion(-11.0, 3.0, 0.0077)
-    front, rear = motion.shift_of(100.0, 0.0), motion.shift_of(-100.0, 0.0)
+    front, rear = map(tuple, shifts_of(np.array([[100.0, 0.0], [-100.0, 0.0]]), *motion).tolist())
     assert eq.centre_shift(front, rear) == pytest.approx((-11.0, 3.0), abs=1e-12)
     assert eq.rotation_between_frames(front[1], rear[1], 200.0) == pytest.approx(0.0077, abs=1e-12)
     assert math.isnan(eq.rotation_between_frames(150.0, -150.0, 200.0))
@@ -83,11 +84,11 @@ def test_motions_compose_and_invert() -> None:
     for _ in range(20):
         a = Motion(*rng.normal(0, 20, 2), rng.normal(0, 1), float(np.exp(rng.normal(0, 0.1))))
         b = Motion(*rng.normal(0, 20, 2), rng.normal(0, 1), float(np.exp(rng.normal(0, 0.1))))
-        u, v = rng.normal(0, 100, 2)
-        du, dv = a.shift_of(u, v)
-        eu, ev = b.shift_of(u + du, v + dv)
-        assert a.then(b).shift_of(u, v) == pytest.approx((du + eu, dv + ev), abs=1e-9)
-        assert a.inverse().shift_of(u + du, v + dv) == pytest.approx((-du, -dv), abs=1e-9)
+        points = rng.normal(0, 100, (5, 2))
+        first = shifts_of(points, *a)
+        second = shifts_of(points + first, *b)
+        np.testing.assert_allclose(shifts_of(points, *a.then(b)), first + second, atol=1e-9)
+        np.testing.assert_allclose(shifts_of(points + first, *a.inverse()), -first, atol=1e-9)
 
 
 def test_forward_motion_moves_the_content_backward() -> None:

@@ -42,11 +42,6 @@ class Motion(NamedTuple):
         c, s = math.cos(self.rotation_rad) / self.scale, math.sin(self.rotation_rad) / self.scale
         return Motion(-(c * self.u + s * self.v), s * self.u - c * self.v, -self.rotation_rad, 1.0 / self.scale)
 
-    def shift_of(self, u: float, v: float) -> tuple[float, float]:
-        """How far the content at (u, v) px from the centre moves, in px."""
-        c, s = self.scale * math.cos(self.rotation_rad), self.scale * math.sin(self.rotation_rad)
-        return c * u - s * v + self.u - u, s * u + c * v + self.v - v
-
     def times(self, factor: float) -> Motion:
         """The motion over `factor` times the time at the same velocities of shift and rotation, at one scale."""
         return Motion(self.u * factor, self.v * factor, self.rotation_rad * factor)
