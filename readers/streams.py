@@ -65,6 +65,7 @@ class StreamKind(enum.StrEnum):
     GNSS = "gnss"
     TRACK = "track"
     SCALAR = "scalar"
+    TEXT = "text"
     UNKNOWN = "unknown"
 
 
@@ -218,6 +219,13 @@ class ScalarSample(Sample):
     """One number of a stream of plain numbers, in the unit that its topic has."""
 
     value: float
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TextSample(Sample):
+    """A piece of text, such as a log line or the list of a simulated mission's faults."""
+
+    text: str
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -385,6 +393,21 @@ class Recording(abc.ABC):
             StreamError: a stream is not in the recording, or is listed as not readable.
             RecordingError: nothing more of the file can be read.
         """
+
+    def arrivals(self, streams: Sequence[str] | None = None) -> Iterator[Sample]:
+        """Yield the samples in the order in which they were received, as far as the recording knows it.
+
+        That of `read` here; a recording whose messages come late or out of order can do better.
+
+        Raises:
+            StreamError: as for `read`.
+        """
+        return self.read(streams)
+
+    @property
+    def identity(self) -> str:
+        """What makes a recording without a file the one that it is; empty where the file itself does."""
+        return ""
 
     def count_before(self, stream: str, t_ns: int) -> int:
         """How many samples of `stream` lie before `t_ns`: the number of the first frame of a window.

@@ -417,6 +417,11 @@ def _with(resolved: Resolved, values: dict[str, Any]) -> Resolved:
 # --------------------------------------------------------------------------------- digest
 
 
+def digest_of(recording: Recording, path: Path) -> str:
+    """SHA-256 of what identifies a recording: what it says of itself where it has no file, else its file."""
+    return hashlib.sha256(recording.identity.encode()).hexdigest() if recording.identity else digest(path)
+
+
 def digest(path: Path) -> str:
     """SHA-256 of what identifies a recording, as hexadecimal digits.
 

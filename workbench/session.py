@@ -196,6 +196,7 @@ def open_any(path: Path, options: ReadOptions) -> Recording:
 def run(
     request: Request,
     *,
+    recording: Recording | None = None,
     on_progress: Callable[[Progress], None] | None = None,
     writers: Writers | None = None,
 ) -> Outcome:
@@ -203,6 +204,7 @@ def run(
 
     Args:
         request: what is asked for.
+        recording: the recording, where it is no file (a simulated mission); else `request.path` is opened.
         on_progress: called after every frame.
         writers: the classes that write the files; those of `workbench.rrd` by default.
 
@@ -216,8 +218,8 @@ def run(
     name = run_name(request.name or preset)
     if request.stride < 1:
         raise SettingsError(f"--stride {request.stride}: must be 1 or more")
-    with open_any(request.path, request.options) as recording:
-        session = _prepare(request, recording, estimator, resolved, name, preset)
+    with recording or open_any(request.path, request.options) as opened:
+        session = _prepare(request, opened, estimator, resolved, name, preset)
         with Interrupt() as interrupt:
             return session.replay(writers or rerun_writers(), interrupt, on_progress)
 
@@ -285,7 +287,7 @@ def _prepare(
         offset_ns=offset_ns,
         scale=scale,
         notes=[*recording.notes, *notes],
-        digest=inputs.digest(request.path),
+        digest=inputs.digest_of(recording, request.path),
     )
 
 

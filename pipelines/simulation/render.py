@@ -21,16 +21,15 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from pipelines.simulation.surfaces import WRAP, Surface
+from pipelines.simulation.sampling import grey_at
+from pipelines.simulation.surfaces import Surface
 
 Floats = NDArray[np.float64]
 
 _quantiles = ndtri((np.arange(1 << 16) + 0.5) / (1 << 16))
 NORMAL = (_quantiles / _quantiles.std()).astype(np.float32)  # standard normal by its 16-bit quantile
 EVERYWHERE = (-math.inf, math.inf, -math.inf, math.inf)
-_SIXTH = np.float32(1 / 6)
-_ZERO, _HALF, _ONE, _FOUR, _WHITE = (np.float32(x) for x in (0, 0.5, 1, 4, 255))
-_THREE, _SIX = np.float32(3), np.float32(6)
+_ZERO, _HALF, _WHITE = (np.float32(x) for x in (0, 0.5, 255))
 _GOLDEN, _MIX1, _MIX2 = np.uint64(0x9E3779B97F4A7C15), np.uint64(0xBF58476D1CE4E5B9), np.uint64(0x94D049BB133111EB)
 _S16, _S27, _S30, _S31 = np.uint64(16), np.uint64(27), np.uint64(30), np.uint64(31)
 _LOW16 = np.uint64(0xFFFF)
@@ -128,23 +127,10 @@ def _texel_h_pixel(surface: Surface, world_h_pixel: Floats) -> Floats:
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _wrap(i: int, n: int, inverse: float) -> int:
-    """The index i modulo n, without an integer division."""
-    i -= n * math.floor(i * inverse)
-    if i < 0:
-        i += n
-    elif i >= n:
-        i -= n
-    return i
-
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
 def _paint(
     coef: NDArray[np.float32], h: Floats, bounds: tuple[float, float, float, float], image: NDArray[np.float32]
 ) -> None:
     """Paint a surface into an image, inside `bounds` (texels x0, x1, y0, y1) with an edge two texels soft."""
-    rows, columns = coef.shape[0] - WRAP, coef.shape[1] - WRAP
-    per_row, per_column = 1.0 / rows, 1.0 / columns
     x0, x1, y0, y1 = bounds
     for v in range(image.shape[0]):
         for u in range(image.shape[1]):
@@ -154,27 +140,7 @@ def _paint(
             inside = min(min(x - x0, x1 - x), min(y - y0, y1 - y)) * 0.5 + 0.5
             if inside <= 0.0:
                 continue
-            whole_x, whole_y = math.floor(x), math.floor(y)
-            i, j = _wrap(whole_y, rows, per_row), _wrap(whole_x, columns, per_column)
-            f, g = np.float32(x - whole_x), np.float32(y - whole_y)
-            e, k = _ONE - f, _ONE - g
-            a0, a1, a2, a3 = (
-                e * e * e,
-                _FOUR - (_SIX - _THREE * f) * f * f,
-                _FOUR - (_SIX - _THREE * e) * e * e,
-                f * f * f,
-            )
-            b0, b1, b2, b3 = (
-                k * k * k,
-                _FOUR - (_SIX - _THREE * g) * g * g,
-                _FOUR - (_SIX - _THREE * k) * k * k,
-                g * g * g,
-            )
-            c0 = b0 * coef[i, j] + b1 * coef[i + 1, j] + b2 * coef[i + 2, j] + b3 * coef[i + 3, j]
-            c1 = b0 * coef[i, j + 1] + b1 * coef[i + 1, j + 1] + b2 * coef[i + 2, j + 1] + b3 * coef[i + 3, j + 1]
-            c2 = b0 * coef[i, j + 2] + b1 * coef[i + 1, j + 2] + b2 * coef[i + 2, j + 2] + b3 * coef[i + 3, j + 2]
-            c3 = b0 * coef[i, j + 3] + b1 * coef[i + 1, j + 3] + b2 * coef[i + 2, j + 3] + b3 * coef[i + 3, j + 3]
-            grey = (a0 * c0 + a1 * c1 + a2 * c2 + a3 * c3) * _SIXTH * _SIXTH
+            grey = grey_at(coef, x, y)
             if inside >= 1.0:
                 image[v, u] = grey
             else:
