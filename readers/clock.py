@@ -131,7 +131,11 @@ def _size_facts(recording: Recording, audits: Mapping[str, StreamAudit]) -> Iter
     listed = [(name, size, sizes) for name, size in made_for.items()]
     if not listed:
         cameras = recording.cameras.items()
-        listed = [(name, (camera.width_px, camera.height_px), {images[name]} & sizes) for name, camera in cameras]
+        listed = [
+            (name, (camera.width_px, camera.height_px), {images[name]} & sizes)
+            for name, camera in cameras
+            if name in images
+        ]
     for name, size, against in listed:
         if against and size != (0, 0) and size not in against:
             found = " or ".join(f"{width} x {height} px" for width, height in sorted(against))

@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import re
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,7 +44,10 @@ _TUM_COLUMNS = [1, 2, 3, 4, 5, 6, 7]
 
 def open_layout(root: Path, options: ReadOptions) -> FolderRecording | None:
     """Open a folder by the first layout that knows it, None if none does."""
-    for layout in (euroc, tum_rgbd, kitti, surface_set, mocap_table, gnss_table, plain_frames):
+    from readers.landmark_tables import landmark_table, mrclam
+
+    layouts = (euroc, tum_rgbd, kitti, surface_set, mocap_table, gnss_table, mrclam, landmark_table, plain_frames)
+    for layout in layouts:
         draft = layout(root, options)
         if draft is not None:
             _note_unused(draft, options)
@@ -100,6 +104,7 @@ def _euroc_camera(draft: Draft, sensor: Path) -> None:
     transform = _matrix4(settings.get("T_BS"))
     if transform is not None:
         draft.note(f"{sensor.name}: body_T_cam (T_BS) is {transform.tolist()}")
+        draft.cameras[sensor.name] = replace(camera, body_t_camera=transform)
     _check_size(draft, sensor.name, camera, files)
 
 

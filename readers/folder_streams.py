@@ -17,6 +17,7 @@ from readers.streams import (
     UNKNOWN_COV3,
     UNKNOWN_COV6,
     UNKNOWN_QUAT,
+    UNKNOWN_VEC3,
     Camera,
     Damage,
     FloatArray,
@@ -24,6 +25,9 @@ from readers.streams import (
     ImageError,
     ImageSample,
     ImuSample,
+    Landmark,
+    LandmarkSample,
+    OdometrySample,
     PoseSample,
     Problem,
     RangeSample,
@@ -33,9 +37,11 @@ from readers.streams import (
     StreamError,
     StreamInfo,
     StreamKind,
+    TrackSample,
 )
 
 Times = NDArray[np.int64]
+Longs = NDArray[np.int64]
 HEAD_BYTES = 4096
 LONG_HEAD_BYTES = 1 << 20
 NORM_TOLERANCE = 0.01
@@ -66,12 +72,13 @@ class FolderRecording(Recording):
         streams: Sequence[FolderStream],
         *,
         cameras: Mapping[str, Camera],
+        landmarks: Mapping[int, Landmark],
         damage: Sequence[Damage],
         notes: Sequence[str],
     ) -> None:
         self.path, self.format, self.notes = path, form, tuple(notes)
         self._streams = {s.info.name: s for s in sorted(streams, key=lambda s: s.info.name)}
-        self._cameras, self._damage = dict(cameras), tuple(damage)
+        self._cameras, self._landmarks, self._damage = dict(cameras), dict(landmarks), tuple(damage)
 
     @property
     def streams(self) -> tuple[StreamInfo, ...]:
@@ -82,6 +89,11 @@ class FolderRecording(Recording):
     def cameras(self) -> dict[str, Camera]:
         """See `Recording.cameras`."""
         return dict(self._cameras)
+
+    @property
+    def landmarks(self) -> dict[int, Landmark]:
+        """See `Recording.landmarks`."""
+        return dict(self._landmarks)
 
     @property
     def damage(self) -> tuple[Damage, ...]:
@@ -111,6 +123,7 @@ class Draft:
     form: str
     streams: list[FolderStream] = field(default_factory=list)
     cameras: dict[str, Camera] = field(default_factory=dict)
+    landmarks: dict[int, Landmark] = field(default_factory=dict)
     damage: list[Damage] = field(default_factory=list)
     notes: list[str] = field(default_factory=list)
     used_rate: bool = False
@@ -119,7 +132,13 @@ class Draft:
     def recording(self) -> FolderRecording:
         """The recording as it was drafted."""
         return FolderRecording(
-            self.path, self.form, self.streams, cameras=self.cameras, damage=self.damage, notes=self.notes
+            self.path,
+            self.form,
+            self.streams,
+            cameras=self.cameras,
+            landmarks=self.landmarks,
+            damage=self.damage,
+            notes=self.notes,
         )
 
     def note(self, sentence: str) -> None:
@@ -192,6 +211,55 @@ class Draft:
             )
 
         self._add(name, StreamKind.IMU, kind, times, make)
+
+    def odometry(self, name: str, times_ns: Times, values: FloatArray, kind: str) -> None:
+        """Add body velocities: linear in m/s and angular in rad/s, values [n, 6], in the body's axes."""
+        order, times = self._ordered(name, times_ns)
+        rows = _frozen(values[order])
+
+        def make(index: int) -> Sample:
+            t_ns = int(times[index])
+            return OdometrySample(
+                stream=name,
+                t_ns=t_ns,
+                received_ns=t_ns,
+                linear_velocity_mps=rows[index, :3],
+                angular_velocity_radps=rows[index, 3:],
+                position_m=UNKNOWN_VEC3,
+                quat_xyzw=UNKNOWN_QUAT,
+            )
+
+        self._add(name, StreamKind.ODOMETRY, kind, times, make)
+
+    def tracks(self, name: str, times_ns: Times, points: Sequence[tuple[Longs, FloatArray]], kind: str) -> None:
+        """Add pixel tracks: of every time the ids [N] and the points (u, v) [N, 2] in px."""
+        order, times = self._ordered(name, times_ns)
+
+        def make(index: int) -> Sample:
+            t_ns = int(times[index])
+            ids, pixels = points[order[index]]
+            return TrackSample(stream=name, t_ns=t_ns, received_ns=t_ns, ids=ids, points_px=pixels)
+
+        self._add(name, StreamKind.TRACK, kind, times, make)
+
+    def sightings(self, name: str, times_ns: Times, ids: Longs, values: FloatArray, kind: str) -> None:
+        """Add measured landmarks: ids [n], range (m) and bearing (rad) [n, 2]; equal times are one sample."""
+        order, times = self._ordered(name, times_ns)
+        moments, starts = np.unique(times, return_index=True)
+        rows = np.split(order, starts[1:])
+
+        def make(index: int) -> Sample:
+            t_ns, chosen = int(moments[index]), rows[index]
+            return LandmarkSample(
+                stream=name,
+                t_ns=t_ns,
+                received_ns=t_ns,
+                ids=ids[chosen],
+                range_m=values[chosen, 0],
+                bearing_rad=values[chosen, 1],
+            )
+
+        self._add(name, StreamKind.LANDMARKS, kind, moments, make)
 
     def gnss(self, name: str, times_ns: Sequence[int] | Times, values: FloatArray, kind: str) -> None:
         """Add fixes: latitude and longitude in rad, altitude in m, values [n, 3]."""

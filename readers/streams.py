@@ -64,6 +64,7 @@ class StreamKind(enum.StrEnum):
     RANGE = "range"
     GNSS = "gnss"
     TRACK = "track"
+    LANDMARKS = "landmarks"
     SCALAR = "scalar"
     TEXT = "text"
     UNKNOWN = "unknown"
@@ -215,6 +216,27 @@ class TrackSample(Sample):
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
+class LandmarkSample(Sample):
+    """Landmarks that a vehicle measured at one moment, N of them.
+
+    `ids` int64 [N]; `range_m` [N] distance in the plane; `bearing_rad` [N] direction from the body's x axis,
+    counter-clockwise; NaN where not measured. `Recording.landmarks` has the places of those that stand still.
+    """
+
+    ids: NDArray[np.int64]
+    range_m: FloatArray
+    bearing_rad: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Landmark:
+    """A surveyed point: `position_m` [3] in the world and the standard deviation `sigma_m` [3], NaN if unknown."""
+
+    position_m: FloatArray
+    sigma_m: FloatArray
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
 class ScalarSample(Sample):
     """One number of a stream of plain numbers, in the unit that its topic has."""
 
@@ -228,13 +250,21 @@ class TextSample(Sample):
     text: str
 
 
+def unknown_transform() -> FloatArray:
+    """A transform [4, 4] that nothing is known of: NaN."""
+    return np.full((4, 4), np.nan)
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Camera:
     """Intrinsics of one camera.
 
     `matrix` K [3, 3] in px, `distortion_model` (``plumb_bob``, ``rational_polynomial``,
     ``equidistant``, … or ``none``), `distortion` [n], `rectification` R [3, 3], `projection`
-    P [3, 4] in px; a matrix that the log does not have is NaN.
+    P [3, 4] in px; a matrix that the log does not have is NaN. `body_t_camera` [4, 4] is the transform that
+    maps points of the camera (x right, y down, z ahead) into the body, whose axes are those of the recording's own
+    odometry, IMU and poses; NaN where unknown.
+    A size of 0 x 0 px is unknown.
     """
 
     width_px: int
@@ -245,6 +275,7 @@ class Camera:
     rectification: FloatArray
     projection: FloatArray
     frame: str = ""
+    body_t_camera: FloatArray = field(default_factory=unknown_transform, repr=False)
 
     @property
     def calibrated(self) -> bool:
@@ -369,6 +400,11 @@ class Recording(abc.ABC):
     @property
     def cameras(self) -> dict[str, Camera]:
         """Intrinsics by the name of the image stream that they belong to."""
+        return {}
+
+    @property
+    def landmarks(self) -> dict[int, Landmark]:
+        """Surveyed landmarks by the number that `LandmarkSample` and `TrackSample` know them by."""
         return {}
 
     @property

@@ -231,10 +231,6 @@ def _refuse_others(path: Path) -> None:
         raise RecordingError(path, "the file is empty (0 bytes)", "give a recording that holds data")
     if kind := image_header(head)[0]:
         raise RecordingError(path, f"a single image ({kind}), not a recording", "give the folder that holds the images")
-    if head.startswith(b"MATLAB 5.0 MAT-file"):
-        raise RecordingError(
-            path, "a MATLAB table, neither a bag, an MCAP file nor a video", "give a recording of one of these formats"
-        )
     if _is_text(head):
         raise RecordingError(
             path,

@@ -738,7 +738,7 @@ def test_many_bad_rows_are_summed_up(tmp_path: Path) -> None:
     [
         ([], "the folder is empty"),
         (["a.bag", "b.mcap"], "2 recordings, not one; give one: a.bag, b.mcap"),
-        (["Robot1_Odometry.dat"], r"no images: its .dat or .mat tables \(Robot1_Odometry.dat\)"),
+        (["odometry.dat"], r"no images: its .dat or .mat tables \(odometry.dat\)"),
         (["notes.txt"], "no images"),
         (["evil\nname\x1b[31m.dat"], r"evil\\nname\\x1b\[31m.dat"),
     ],

@@ -49,6 +49,12 @@ TILT = {
     "/velocity": 712,
 }
 CAMERA = {"/camera_calibration": 10, "/camera_calibration/custom": 10, "/image/compressed": 10}
+STARRY = {
+    "camera/left/tracks": 900,
+    "camera/right/tracks": 900,
+    "vehicle/odometry": 900,
+    "vehicle/reference": 900,
+}
 GENERATOR = ("quaternion_norm",)
 
 OUTCOMES: dict[str, Opens | Refused] = {
@@ -125,9 +131,13 @@ OUTCOMES: dict[str, Opens | Refused] = {
     "_no_licence_stated/downward_checker_60fps_a": Opens(
         "image folder with a motion-capture table", {"images": 869, "mocap": 7315}, 0, ("gap",)
     ),
-    "_no_licence_stated/mrclam1_robot1": Refused("data of range or landmark measurements"),
-    "_no_licence_stated/starry_night_stereo_landmarks": Refused("data of range or landmark measurements"),
-    "_no_licence_stated/starry_night_stereo_landmarks/dataset3_k0000_0899.mat": Refused("a MATLAB table"),
+    "_no_licence_stated/mrclam1_robot1": Opens(
+        "UTIAS MRCLAM folder", {"robot1/landmarks": 3774, "robot1/odometry": 97890}, 0, ("gap",)
+    ),
+    "_no_licence_stated/starry_night_stereo_landmarks": Opens("UTIAS course table", STARRY, 0, ("gap",)),
+    "_no_licence_stated/starry_night_stereo_landmarks/dataset3_k0000_0899.mat": Opens(
+        "UTIAS course table", STARRY, 0, ("gap",)
+    ),
 }
 
 

@@ -108,7 +108,6 @@ def test_streams_are_asked_for_by_name(video: Path) -> None:
         ("empty.avi", b"", r"empty \(0 bytes\)"),
         ("junk.mp4", bytes(range(256)) * 100, "none of the known formats"),
         ("list.m3u8", b"#EXTM3U\n#EXTINF:1,\n/etc/passwd\n", "a text file"),
-        ("table.mat", b"MATLAB 5.0 MAT-file" + bytes(200), "MATLAB table"),
         ("one.png", cv2.imencode(".png", np.zeros((4, 4), np.uint8))[1].tobytes(), r"single image \(png\).*folder"),
         ("odometry.dat", b"1248272272.841 0.074 0.229\n", "a text file.*give the folder"),
     ],
@@ -137,9 +136,5 @@ def test_missing_file(tmp_path: Path) -> None:
 
 def test_shared_files_that_are_no_video() -> None:
     folder = RECORDINGS / "_no_licence_stated"
-    for name, words in (
-        ("starry_night_stereo_landmarks/dataset3_k0000_0899.mat", "MATLAB table"),
-        ("mrclam1_robot1/Robot1_Odometry.dat", "text file"),
-    ):
-        with pytest.raises(RecordingError, match=words):
-            open_video(folder / name)
+    with pytest.raises(RecordingError, match="text file"):
+        open_video(folder / "mrclam1_robot1" / "Robot1_Odometry.dat")
