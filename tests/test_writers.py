@@ -14,7 +14,8 @@ from rosbags.typesys import Stores, get_typestore
 
 from pipelines.simulation import mission as sim
 from pipelines.simulation import trajectories as ways
-from pipelines.simulation.mission import SimulatedMission, nadir_camera
+from pipelines.simulation.faults import DroppedFrames
+from pipelines.simulation.mission import SimulatedMission, nadir_camera, nadir_mission
 from pipelines.simulation.surfaces import tiles
 from readers.streams import (
     ImageError,
@@ -53,12 +54,12 @@ class Given(Recording):
 @pytest.fixture(scope="module")
 def mission() -> SimulatedMission:
     poses = ways.follow(ways.circle(), np.full(7, 0.008))
-    return SimulatedMission(
+    return nadir_mission(
         tiles(64, np.random.default_rng(0)),
         poses,
         camera=nadir_camera(80, 60, 100),
         height_m=np.linspace(0.2, 0.21, 8),
-        faults=[sim.DroppedFrames(2, 3)],
+        faults=[DroppedFrames(start_s=1.5 / 60, stop_s=2.5 / 60)],
     )
 
 
@@ -102,7 +103,7 @@ def test_mcap_reads_back_what_was_written(mission: SimulatedMission, tmp_path: P
         pose, height = found[sim.POSE][k][0], found[sim.HEIGHT][k][0]
         x, y, heading = mission.truth_poses[k]
         assert (pose.pose.position.x, pose.pose.position.y) == (x, y)
-        assert pose.pose.position.z == mission.height_m[k]
+        assert pose.pose.position.z == np.linspace(0.2, 0.21, 8)[k]
         assert 2 * np.arctan2(pose.pose.orientation.z, pose.pose.orientation.w) == pytest.approx(heading, abs=1e-15)
         assert pose.header.frame_id == "world"
         assert height.range == np.float32(mission.height_m[k])
