@@ -106,7 +106,7 @@ def test_mcap_reads_back_what_was_written(mission: SimulatedMission, tmp_path: P
         assert pose.pose.position.z == np.linspace(0.2, 0.21, 8)[k]
         assert 2 * np.arctan2(pose.pose.orientation.z, pose.pose.orientation.w) == pytest.approx(heading, abs=1e-15)
         assert pose.header.frame_id == "world"
-        assert height.range == np.float32(mission.height_m[k])
+        assert height.range == np.float32(np.linspace(0.2, 0.21, 8)[k])
         assert height.max_range == np.inf
     info = found[sim.INFO][0][0]
     assert np.array_equal(np.reshape(info.k, (3, 3)), mission.camera.matrix)
