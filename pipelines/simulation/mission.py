@@ -10,37 +10,32 @@ import dataclasses
 import hashlib
 import heapq
 import json
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from operator import itemgetter
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
-from pipelines.geometry import quat_of_heading
 from pipelines.simulation.channels import Channel, Longs
 from pipelines.simulation.faults import Fault
-from pipelines.simulation.imaging import OF_IMAGES, CameraOnBoard, ground_view, pinhole
+from pipelines.simulation.imaging import OF_IMAGES, CameraOnBoard
+from pipelines.simulation.lens import pinhole
 from pipelines.simulation.motion import Motion, Mount, Waypoints
 from pipelines.simulation.patches import OF_GROUND, faults_met, patches_of
+from pipelines.simulation.scene import Scene
+from pipelines.simulation.sensors import CALIBRATION, REFERENCE, Height, Reference, camera_info_channel
+from pipelines.simulation.sensors import HEIGHT as RANGE
+from pipelines.simulation.sensors import height_channel, reference_channel
 from pipelines.simulation.surfaces import Surface
-from readers.streams import (
-    UNKNOWN_COV6,
-    Camera,
-    PoseSample,
-    RangeSample,
-    Recording,
-    Sample,
-    StreamError,
-    StreamInfo,
-    StreamKind,
-)
+from pipelines.simulation.timing import Timing, schedule
+from readers.streams import Camera, CameraInfo, Recording, Sample, StreamError, StreamInfo
 
 Floats = NDArray[np.float64]
 
-IMAGE, INFO, POSE, HEIGHT = "/camera/image_raw", "/camera/camera_info", "/reference/pose", "/camera/height"
-WORLD_FRAME, CAMERA_FRAME = "world", "camera_ground"
+IMAGE, INFO, POSE, HEIGHT = "/camera/image_raw", CALIBRATION, REFERENCE, RANGE
+CAMERA_FRAME = "camera_ground"
 START_NS = 1_700_000_000_000_000_000
 PAPER_HEIGHT_M, PAPER_FOCAL_PX, PAPER_SIDE_PX = 0.2002, 256.0, 512
 
@@ -86,9 +81,9 @@ class SimulatedMission(Recording):
             raise ValueError(f"{name}: two channels have the same name: {[channel.stream for channel in channels]}")
         if self.on_board:
             first = self.on_board[0]
-            self.truth_t_ns = first.t_ns
-            self.truth_poses = camera_poses(first.mount, motion, first.t_s)
-            self.metres_per_px = _price_of_pixel(first)
+            self.truth_t_ns, self.truth_poses = first.t_ns, first.poses
+            self.metres_per_px = float(np.mean(first.heights_m) / first.camera.matrix[0, 0])
+            self._sent = set(first.plan.number.tolist())
 
     # ------------------------------------------------------------------------------ frames
 
@@ -98,17 +93,16 @@ class SimulatedMission(Recording):
         return self.on_board[0].camera
 
     def frame(self, k: int) -> NDArray[np.uint8]:
-        """The image that the first camera sends for its frame k, uint8 [height, width].
+        """The image that the first camera takes for its frame k, uint8 [height, width], whether it arrives or not.
 
         Raises:
             IndexError: there is no such frame.
         """
-        camera = self.on_board[0]
-        return camera.picture(camera.shown(k) if 0 <= k < len(camera.t_s) else k)
+        return self.on_board[0].picture(k)
 
     def sent(self, k: int) -> bool:
         """Whether the image of the first camera's frame k arrives."""
-        return self.on_board[0].sent(k)
+        return k in self._sent
 
     # --------------------------------------------------------------------------- recording
 
@@ -125,7 +119,13 @@ class SimulatedMission(Recording):
     @property
     def cameras(self) -> dict[str, Camera]:
         """The calibration that each camera sends first."""
-        return {camera.stream: camera.sent_camera(float(camera.t_s[0])) for camera in self.on_board}
+        sent: dict[str, Camera] = {}
+        for camera in self.on_board:
+            info = self._channels.get(info_stream_of(camera.stream))
+            if info is not None and len(info.number):
+                first = info.sample(int(info.number[0]), int(info.stamp_ns[0]), int(info.received_ns[0]))
+                sent[camera.stream] = first.camera if isinstance(first, CameraInfo) else camera.camera
+        return sent
 
     def read(
         self,
@@ -203,18 +203,6 @@ def _info(channel: Channel) -> StreamInfo:
     )
 
 
-def camera_poses(mount: Mount, motion: Motion, t_s: Floats) -> Floats:
-    """Where a camera is at times [n], seen from above: x (m), y (m), heading of its u axis (rad, continuous) [n, 3]."""
-    world_r_camera, position = mount.world_t_camera(motion.at(t_s))
-    heading = np.unwrap(np.arctan2(world_r_camera[:, 1, 0], world_r_camera[:, 0, 0]))
-    return np.column_stack([position[:, :2], heading])
-
-
-def _price_of_pixel(camera: CameraOnBoard) -> float:
-    _, position = camera.mount.world_t_camera(camera.motion.at(camera.t_s))
-    return float(np.mean(position[:, 2]) / camera.camera.matrix[0, 0])
-
-
 # ---------------------------------------------------------------------- a camera over a surface
 
 
@@ -265,31 +253,36 @@ def nadir_mission(
     Raises:
         ValueError: an array has another length than the poses, or a fault is of another kind.
     """
-    t_s = np.arange(len(poses)) / rate_hz
-    motion, mount, camera = Waypoints(t_s, poses, height_m, roll_rad, pitch_rad), Mount(), camera or nadir_camera()
+    motion = Waypoints(np.arange(len(poses)) / rate_hz, poses, height_m, roll_rad, pitch_rad)
+    mount, camera, timing = Mount(), camera or nadir_camera(), Timing(rate_hz=rate_hz)
     unfit = [fault.name for fault in faults if not isinstance(fault, OF_IMAGES + OF_GROUND)]
     if unfit:
         raise ValueError(f"{name}: {unfit[0]} is no fault of the images or the ground; make a scenario for it")
-    met = faults_met(faults, camera, mount, motion, t_s)
-    patches = patches_of(met, surface, seed)
+    met = faults_met(faults, camera, mount, motion, timing.times_s(motion.duration_s))
+    start = {"start_ns": start_ns, "seed": seed}
+    plan = schedule(timing, duration_s=motion.duration_s, stream=IMAGE, faults=met, **start)
     on_board = CameraOnBoard(
         stream=IMAGE,
-        info_stream=INFO,
         camera=camera,
         mount=mount,
         motion=motion,
+        scene=Scene(surface, patches_of(met, surface, seed)),
+        plan=plan,
         rate_hz=rate_hz,
-        t_s=t_s,
-        start_ns=start_ns,
-        view=ground_view(surface, patches, camera, mount, motion),
         noise_grey=noise_grey,
         vignetting=vignetting,
-        seed=seed,
         faults=met,
         name=name,
+        **start,
     )
+    channels = [
+        camera_info_channel(camera, timing, duration_s=motion.duration_s, faults=met, **start),
+        reference_channel(motion, Reference(timing=timing, child_frame=CAMERA_FRAME), **start),
+        height_channel(motion, Height(timing=timing), mount, **start),
+        on_board.channel(),
+    ]
     return SimulatedMission(
-        [on_board.info_channel(), *_truth_channels(on_board), on_board.image_channel()],
+        channels,
         name=name,
         start_ns=start_ns,
         motion=motion,
@@ -297,8 +290,8 @@ def nadir_mission(
         faults=met,
         description={
             "name": name,
-            "surface": _digest(surface.coefficients) + f" {surface.texels_per_px} {surface.metres_per_px!r}",
-            "motion": _digest(t_s, motion.poses, motion.height_m, motion.roll_rad, motion.pitch_rad),
+            "surface": digest(surface.coefficients) + repr((surface.texels_per_px, surface.metres_per_px, surface.scatter)),
+            "motion": digest(motion.t_s, poses, motion.height_m, motion.roll_rad, motion.pitch_rad),
             "camera": [camera.width_px, camera.height_px, camera.matrix.tolist()],
             "images": [start_ns, noise_grey, vignetting, seed],
             "faults": [[fault.name, dataclasses.asdict(fault)] for fault in met],
@@ -306,56 +299,14 @@ def nadir_mission(
     )
 
 
-def _truth_channels(camera: CameraOnBoard) -> list[Channel]:
-    """Pose and height of a camera without fail, at the times of its pictures."""
-    poses = camera_poses(camera.mount, camera.motion, camera.t_s)
-    height_m = camera.mount.world_t_camera(camera.motion.at(camera.t_s))[1][:, 2]
-
-    def pose(number: int, t_ns: int, received_ns: int) -> PoseSample:
-        x, y, heading = poses[number]
-        return PoseSample(
-            stream=POSE,
-            t_ns=t_ns,
-            received_ns=received_ns,
-            position_m=np.array([x, y, height_m[number]]),
-            quat_xyzw=quat_of_heading(float(heading)),
-            covariance=UNKNOWN_COV6,
-            parent_frame=WORLD_FRAME,
-            child_frame=CAMERA_FRAME,
-        )
-
-    def height(number: int, t_ns: int, received_ns: int) -> RangeSample:
-        return RangeSample(
-            stream=HEIGHT,
-            t_ns=t_ns,
-            received_ns=received_ns,
-            range_m=float(height_m[number]),
-            min_range_m=0.0,
-            max_range_m=float("inf"),
-            field_of_view_rad=0.0,
-        )
-
-    def channel(stream: str, kind: StreamKind, ros_type: str, frame: str, sample: Callable[..., Sample]) -> Channel:
-        times = camera.t_ns
-        return Channel(
-            stream=stream,
-            kind=kind,
-            type=ros_type,
-            frame=frame,
-            number=np.arange(len(times)),
-            stamp_ns=times,
-            received_ns=times,
-            sample=sample,
-        )
-
-    return [
-        channel(POSE, StreamKind.POSE, "geometry_msgs/msg/PoseStamped", WORLD_FRAME, pose),
-        channel(HEIGHT, StreamKind.RANGE, "sensor_msgs/msg/Range", camera.camera.frame, height),
-    ]
-
-
-def _digest(*arrays: Any) -> str:
+def digest(*arrays: ArrayLike) -> str:
+    """SHA-256 of the values of some arrays, as hexadecimal digits."""
     total = hashlib.sha256()
     for array in arrays:
         total.update(np.ascontiguousarray(array).tobytes())
     return total.hexdigest()
+
+
+def info_stream_of(image_stream: str) -> str:
+    """Where the calibration of a camera is sent: ``…/camera_info`` beside its images."""
+    return image_stream.rpartition("/")[0] + "/camera_info"

@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from pipelines.simulation.channels import rng_of
 from pipelines.simulation.faults import Fault, LowTexture, RepetitiveTexture
+from pipelines.simulation.lens import rays
 from pipelines.simulation.motion import Motion, Mount
-from pipelines.simulation.render import Patch
+from pipelines.simulation.scene import Patch
 from pipelines.simulation.surfaces import Surface, surface_from_periodic, tiles
 from readers.streams import Camera
 
@@ -31,13 +32,12 @@ OnGround = RepetitiveTexture | LowTexture
 
 
 def ground_points(camera: Camera, mount: Mount, motion: Motion, t_s: Floats, pixels: Floats) -> Floats:
-    """Where rays through pixels [p, 2] of a camera without distortion meet z = 0: x, y in m [n, p, 2].
+    """Where rays through pixels [p, 2] of a camera meet z = 0: x, y in m [n, p, 2].
 
     A ray that does not go down gives infinity or no number.
     """
     world_r_camera, position = mount.world_t_camera(motion.at(t_s))
-    rays = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.matrix).T
-    ways = np.einsum("nij,pj->npi", world_r_camera, rays)
+    ways = np.einsum("nij,pj->npi", world_r_camera, rays(camera, pixels))
     with np.errstate(divide="ignore", invalid="ignore"):
         reach = np.where(ways[..., 2] < 0, -position[:, None, 2] / ways[..., 2], np.inf)
         points = position[:, None, :2] + reach[..., None] * ways[..., :2]

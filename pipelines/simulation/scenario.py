@@ -347,6 +347,7 @@ def _camera(
     with _named("front" if base is FORWARD else "camera"):
         return CameraOnBoard(
             stream=stream,
+            start_ns=scenario.start_ns,
             camera=_intrinsics(section, frame),
             mount=_mount(section, base),
             motion=motion,
