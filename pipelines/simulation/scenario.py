@@ -8,8 +8,10 @@ from __future__ import annotations
 
 import contextlib
 import inspect
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from pathlib import PurePath
 from typing import Any
 
 import numpy as np
@@ -146,7 +148,7 @@ def build(scenario: Scenario, *, picture: ArrayLike | None = None) -> SimulatedM
     motion = _motion(scenario)
     faults = _met(scenario, motion)
     cameras = _cameras(scenario, motion, faults, picture)
-    values = scenario.model_dump(mode="json") | ({} if picture is None else {"picture_digest": digest(picture)})
+    values = described(scenario, picture)
     truth = faults_channel(faults, start_ns=scenario.start_ns, scenario=values)
     return SimulatedMission(
         [truth, *_channels(scenario, motion, faults), *(camera.channel() for camera in cameras)],
@@ -157,6 +159,23 @@ def build(scenario: Scenario, *, picture: ArrayLike | None = None) -> SimulatedM
         faults=faults,
         description=values,
     )
+
+
+def described(scenario: Scenario, picture: ArrayLike | None = None) -> dict[str, Any]:
+    """The scenario in values that JSON has: equal for equal missions, wherever their picture lies."""
+    values: dict[str, Any] = _as_json(scenario.model_dump(mode="json"))
+    if picture is not None:
+        values["ground"] |= {"picture": PurePath(scenario.ground.picture).name, "picture_digest": digest(picture)}
+    return values
+
+
+def _as_json(value: Any) -> Any:
+    """The value with infinities as texts, for which JSON has no numbers."""
+    if isinstance(value, dict):
+        return {key: _as_json(inner) for key, inner in value.items()}
+    if isinstance(value, list | tuple):
+        return [_as_json(inner) for inner in value]
+    return str(value) if isinstance(value, float) and not math.isfinite(value) else value
 
 
 @contextlib.contextmanager

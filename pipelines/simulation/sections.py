@@ -224,6 +224,11 @@ AnyTracks = Annotated[Tracks, _known(Tracks)]
 # ---------------------------------------------------------------------------- descriptions
 
 
+def is_section(value: Any) -> bool:
+    """Whether a value of a scenario has keys of its own with meanings."""
+    return isinstance(value, BaseModel) or (dataclasses.is_dataclass(value) and not isinstance(value, Fault | type))
+
+
 def meanings(kind: type) -> dict[str, str]:
     """What the keys of a section or of a sensor's dataclass are, by key."""
     if issubclass(kind, BaseModel):
