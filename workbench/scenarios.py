@@ -78,9 +78,7 @@ def _read(file: Path) -> dict[str, Any]:
 # ---------------------------------------------------------------------------------- loading
 
 
-def load(
-    wanted: str, *, overrides: Sequence[str] = (), seed: int | None = None, picture: Path | None = None
-) -> Loaded:
+def load(wanted: str, *, overrides: Sequence[str] = (), seed: int | None = None, picture: Path | None = None) -> Loaded:
     """A scenario with overrides.
 
     Args:

@@ -25,9 +25,16 @@ from pipelines.simulation.lens import pinhole
 from pipelines.simulation.motion import Motion, Mount, Waypoints
 from pipelines.simulation.patches import OF_GROUND, faults_met, patches_of
 from pipelines.simulation.scene import Scene
-from pipelines.simulation.sensors import CALIBRATION, REFERENCE, Height, Reference, camera_info_channel
+from pipelines.simulation.sensors import (
+    CALIBRATION,
+    REFERENCE,
+    Height,
+    Reference,
+    camera_info_channel,
+    height_channel,
+    reference_channel,
+)
 from pipelines.simulation.sensors import HEIGHT as RANGE
-from pipelines.simulation.sensors import height_channel, reference_channel
 from pipelines.simulation.surfaces import Surface
 from pipelines.simulation.timing import Timing, schedule
 from readers.streams import Camera, CameraInfo, Recording, Sample, StreamError, StreamInfo
@@ -259,7 +266,7 @@ def nadir_mission(
     if unfit:
         raise ValueError(f"{name}: {unfit[0]} is no fault of the images or the ground; make a scenario for it")
     met = faults_met(faults, camera, mount, motion, timing.times_s(motion.duration_s))
-    start = {"start_ns": start_ns, "seed": seed}
+    start: dict[str, Any] = {"start_ns": start_ns, "seed": seed}
     plan = schedule(timing, duration_s=motion.duration_s, stream=IMAGE, faults=met, **start)
     on_board = CameraOnBoard(
         stream=IMAGE,
@@ -290,7 +297,8 @@ def nadir_mission(
         faults=met,
         description={
             "name": name,
-            "surface": digest(surface.coefficients) + repr((surface.texels_per_px, surface.metres_per_px, surface.scatter)),
+            "surface": digest(surface.coefficients)
+            + repr((surface.texels_per_px, surface.metres_per_px, surface.scatter)),
             "motion": digest(motion.t_s, poses, motion.height_m, motion.roll_rad, motion.pitch_rad),
             "camera": [camera.width_px, camera.height_px, camera.matrix.tolist()],
             "images": [start_ns, noise_grey, vignetting, seed],

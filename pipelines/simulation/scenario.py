@@ -11,10 +11,12 @@ import inspect
 import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import PurePath
 from typing import Any
 
 import numpy as np
+import scipy.ndimage
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
@@ -66,7 +68,7 @@ from pipelines.simulation.sensors import (
 )
 from pipelines.simulation.signals import fluctuation
 from pipelines.simulation.speeds import SPEEDS, Speed, speed
-from pipelines.simulation.surfaces import Surface, surface_from_image
+from pipelines.simulation.surfaces import WRAP, Surface, surface_from_image
 from pipelines.simulation.timing import schedule
 from readers.streams import Camera
 
@@ -292,8 +294,9 @@ def _surface(scenario: Scenario, picture: ArrayLike | None) -> Surface:
             size_px=given.size_px,
             contrast=given.contrast,
             repetition=given.repetition,
+            spectrum=given.spectrum,
             metres_per_px=given.metres_per_px,
-            **given.options,
+            scatter=given.arrange == "scatter",
         )
 
 
@@ -303,6 +306,13 @@ def _relief(scenario: Scenario) -> Relief | None:
         return None
     seed = int(rng_of(scenario.seed, "relief").integers(1 << 62))
     return Relief(given.relief_height_m, given.relief_correlation_m, seed)
+
+
+def height_of(relief: Relief, x_m: Floats, y_m: Floats) -> Floats:
+    """Height of a relief in m [n] at world x and y, each [n]: its cubic B-spline, rows running along minus y."""
+    places = np.stack([-np.asarray(y_m), np.asarray(x_m)]) / relief.metres_per_sample
+    period = relief.coefficients[1 : 1 - WRAP, 1 : 1 - WRAP].astype(np.float64)
+    return np.asarray(scipy.ndimage.map_coordinates(period, places, order=3, mode="grid-wrap", prefilter=False))
 
 
 def _scene(scenario: Scenario, faults: Sequence[Fault], picture: ArrayLike | None) -> Scene:
@@ -406,7 +416,7 @@ def _channels(scenario: Scenario, motion: Motion, faults: tuple[Fault, ...]) -> 
         yield reference_channel(motion, _at_camera(scenario.reference, scenario), **start)
     if scenario.height is not None and scenario.camera is not None:
         mount, relief = _mount(scenario.camera, NADIR), _relief(scenario)
-        ground = level_ground if relief is None else relief.height_m
+        ground = level_ground if relief is None else partial(height_of, relief)
         yield height_channel(motion, scenario.height, mount, ground=ground, **start)
     if scenario.imu is not None:
         yield imu_channel(motion, scenario.imu, faults=faults, **start)

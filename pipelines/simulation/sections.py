@@ -120,12 +120,12 @@ class Ground(Section):
     """The ground at z = 0."""
 
     family: str = Field("gravel", description="family of the texture, see families.py")
-    contrast: Positive = Field(1.0, description="contrast, 1 for what is usual for the family")
-    repetition: Share = Field(0.0, description="how alike its elements are, 0…1")
-    size_px: Count = Field(1024, description="side of the picture that the ground is laid of")
-    options: Parameters = Field({}, description="further parameters of the family")
+    contrast: Positive | None = Field(None, description="gradient rms, grey levels per px; None: the family's own")
+    repetition: Share | None = Field(None, description="share of it that repeats; None: the family's own")
+    spectrum: NotNegative | None = Field(None, description="β of its spectrum ~ f^-β; None: the family's own")
+    size_px: Count = Field(1024, description="side of the picture that the ground is laid of, a multiple of 256")
     picture: str = Field("", description="picture file that the ground is made of, in place of a family")
-    arrange: Literal["mirror", "scatter"] = Field("scatter", description="how a picture becomes endless ground")
+    arrange: Literal["mirror", "scatter"] = Field("scatter", description="how the picture becomes endless ground")
     psf_sigma_px: NotNegative = Field(PSF_SIGMA_PX, description="softness of a picture, px")
     metres_per_px: Positive = Field(PAPER_METRES_PER_PX, description="what a pixel of the texture measures, m")
     relief_height_m: NotNegative = Field(0.0, description="standard deviation of bumps of the ground")

@@ -157,7 +157,7 @@ class Surface:
             s.x.coherence,
             s.y.coherence,
             s.stagger,
-            s.mean_grey,
+            float(s.mean_grey),
             int(np.random.SeedSequence(s.seed).generate_state(1, np.uint64)[0] >> 1),
         )
 
