@@ -353,7 +353,8 @@ def _soil(size_px: int, rng: Rng) -> Floats:
 def _sand(size_px: int, rng: Rng) -> Floats:
     """Grains too fine to be seen, some coarser ones, and a gently uneven bed."""
     radius = _power_law(1.2, 5.0, 0.05 * size_px**2, rng)
-    grey = 120 + 16 * _noise(size_px, rng, along_x_px=0.8) + 12 * _fractal(size_px, rng, 1.2)
+    rough = np.exp(0.45 * _noise(size_px, rng, along_x_px=18))
+    grey = 120 + 13 * rough * _noise(size_px, rng, along_x_px=0.8) + 10 * _fractal(size_px, rng, 1.3)
     return _heaped(grey, radius, (0.6, 1.0), (-0.2, 0.6), rng.normal(120, 40, len(radius)), rng)
 
 
@@ -369,8 +370,8 @@ def _mud(size_px: int, rng: Rng) -> Floats:
     crack = np.exp(-((rim / (4 + 2 * _noise(size_px, rng, along_x_px=30))) ** 2))
     curl = np.exp(-rim / 14)
     tone = rng.standard_normal(len(centres))[plate[..., 0]]
-    relief = 30 * curl + 14 * _fractal(size_px, rng, 1.9)
-    return np.asarray(3 * tone + 8 * _lit(relief) - 55 * crack + 2.5 * _fractal(size_px, rng, 0.7))
+    relief = 30 * curl + 10 * _fractal(size_px, rng, 2.2)
+    return np.asarray(4 * tone + 7 * _lit(relief) - 60 * crack + 4 * _fractal(size_px, rng, 1.9))
 
 
 def _concrete(size_px: int, rng: Rng) -> Floats:
@@ -386,9 +387,9 @@ def _wood(size_px: int, rng: Rng) -> Floats:
     bend = 1.3 * _noise(size_px, rng, along_x_px=110, along_y_px=34) + 0.1 * _noise(size_px, rng, along_x_px=20)
     year = (y / 16 + bend) % 1.0
     rings = year**2 * np.clip((1 - year) / 0.15, 0, 1)
-    fibres = _noise(size_px, rng, along_x_px=16, along_y_px=0.7)
-    pores = np.minimum(_noise(size_px, rng, along_x_px=6, along_y_px=0.6) + 1.5, 0)
-    grain = _unit(rings) + 0.5 * fibres + 0.8 * pores + 0.6 * _noise(size_px, rng, along_x_px=70, along_y_px=6)
+    fibres = _noise(size_px, rng, along_x_px=5, along_y_px=0.8)
+    pores = np.minimum(_noise(size_px, rng, along_x_px=2, along_y_px=0.7) + 1.5, 0)
+    grain = _unit(rings) + 0.7 * fibres + 2.4 * pores + 0.6 * _noise(size_px, rng, along_x_px=70, along_y_px=6)
     for board in range(0, size_px, BOARD_PX):
         plank = grain[board : board + BOARD_PX]
         plank[:] = np.roll(plank, rng.integers(size_px), axis=1) + 0.7 * rng.standard_normal()
@@ -401,12 +402,11 @@ def _board_joints(shape: tuple[int, int], rng: Rng) -> Floats:
 
 
 def _metal(size_px: int, rng: Rng) -> Floats:
-    """Wear of sheet metal: fine scratches and smudges."""
-    scratches = sum(
-        np.where(_noise(size_px, rng, along_x_px=long, along_y_px=wide) > 2.2, 1.0, 0.0)
-        for long, wide in ((30, 0.7), (0.7, 30), (12, 0.7), (0.7, 12))
-    )
-    return np.asarray(0.7 * scratches + 0.35 * _noise(size_px, rng, along_x_px=0.8) + 0.5 * _fractal(size_px, rng, 1.4))
+    """Wear of sheet metal: smudges and a few hair-fine scratches."""
+    smudges = _noise(size_px, rng, along_x_px=36) + 0.15 * _fractal(size_px, rng, 2.2)
+    for long, wide in ((24, 0.7), (0.7, 24), (9, 0.7), (0.7, 9)):
+        smudges += 0.25 * (_noise(size_px, rng, along_x_px=long, along_y_px=wide) > 2.6)
+    return smudges + 0.014 * _noise(size_px, rng, along_x_px=0.7)
 
 
 def _tread(shape: tuple[int, int], rng: Rng) -> Floats:
@@ -430,7 +430,7 @@ def _street(size_px: int, rng: Rng) -> Floats:
     tone = rng.standard_normal((size_px // PAVER_PX[0], size_px // PAVER_PX[1]))
     tone = np.kron(tone, np.ones(PAVER_PX))
     grain = _noise(size_px, rng, along_x_px=0.9)
-    return np.asarray(0.5 * tone + 0.6 * grain + 0.8 * _fractal(size_px, rng, 1.4))
+    return np.asarray(0.7 * tone + 0.03 * grain + 0.5 * _fractal(size_px, rng, 2.2))
 
 
 def _paver_joints(shape: tuple[int, int], rng: Rng) -> Floats:
