@@ -403,10 +403,10 @@ def _board_joints(shape: tuple[int, int], rng: Rng) -> Floats:
 
 def _metal(size_px: int, rng: Rng) -> Floats:
     """Wear of sheet metal: smudges and a few hair-fine scratches."""
-    smudges = _noise(size_px, rng, along_x_px=36) + 0.15 * _fractal(size_px, rng, 2.2)
+    smudges = _noise(size_px, rng, along_x_px=40) + 0.15 * _fractal(size_px, rng, 2.2)
     for long, wide in ((24, 0.7), (0.7, 24), (9, 0.7), (0.7, 9)):
         smudges += 0.25 * (_noise(size_px, rng, along_x_px=long, along_y_px=wide) > 2.6)
-    return smudges + 0.014 * _noise(size_px, rng, along_x_px=0.7)
+    return smudges + 0.06 * _noise(size_px, rng, along_x_px=0.7)
 
 
 def _tread(shape: tuple[int, int], rng: Rng) -> Floats:
@@ -419,9 +419,9 @@ def _tread(shape: tuple[int, int], rng: Rng) -> Floats:
             for turn, shift in ((1, 0.25), (-1, 0.75)):
                 y, x = v - (row + shift) * rows, u - (column + shift) * columns
                 p, q = (x + turn * y) / 2**0.5, (y - turn * x) / 2**0.5
-                height = np.maximum(height, np.clip(1 - (p / 46) ** 2 - np.abs(q) / 7, 0, None))
+                height = np.maximum(height, np.clip(1 - (p / 50) ** 2 - np.abs(q) / 9, 0, None))
     height = _smoothed(height, 1.0)
-    lit = np.tanh(2.5 * _lit(7 * height) + 0.5 * height)
+    lit = np.tanh(3.5 * _lit(7 * height) + 0.3 * height)
     return np.asarray(lit[rows : 2 * rows, columns : 2 * columns])
 
 
@@ -477,10 +477,12 @@ FAMILIES: dict[str, Family] = {
         _metal,
         contrast=10.5,
         spectrum=1.30,
-        mean_grey=165,
+        mean_grey=150,
         repetition=0.87,
         pattern=_tread,
         period_px=(TREAD_PX, TREAD_PX),
+        x=Bond(band_px=160),
+        y=Bond(band_px=160),
     ),
     "street": Family(
         _street,
