@@ -115,6 +115,7 @@ def grey_at(coef: NDArray[np.float32], cells: Cells, x: float, y: float) -> Any:
         place_x = (along - i) * cells.side_x
         if place_x < cells.band_x or place_y < cells.band_y:
             return _blended_at(coef, cells, x, y)
-        off_x, off_y = _offset(cells, i, j)
-        x, y = place_x + off_x, place_y + off_y
+        offset = _offset(cells, i, j)
+        x = place_x + offset[0]
+        y = place_y + offset[1]
     return _spline_at(coef, x, y)

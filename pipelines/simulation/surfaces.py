@@ -222,8 +222,9 @@ def scattered(surface: Surface, seed: int, *, cell_px: float = CELL_PX, band_px:
 def _flattened(picture: Floats, sigma_px: float) -> Floats:
     if not sigma_px > 0:
         raise ValueError(f"flatten_px {sigma_px}: it must be above 0, or None")
-    light = scipy.ndimage.gaussian_filter(picture, sigma_px, mode="reflect")
-    return np.asarray(picture - light + light.mean())
+    rows, columns = (np.exp(-0.5 * (sigma_px * np.pi * np.arange(n) / n) ** 2) for n in picture.shape)
+    light = scipy.fft.idctn(scipy.fft.dctn(picture) * np.outer(rows, columns))
+    return np.asarray(picture - light + picture.mean())
 
 
 def _cut_to_cells(picture: Floats, metres_per_px: float, psf_sigma_px: float, seed: int) -> Surface:
