@@ -125,6 +125,20 @@ def rays(camera: Camera, pixels: Floats) -> Floats:
     return np.column_stack([flat, np.ones(len(flat))])
 
 
+def ray_table(camera: Camera) -> tuple[Floats, NDArray[np.float32]]:
+    """The rays of all pixels: x, y at unit depth [height, width, 2], and ∂x/∂u, ∂x/∂v, ∂y/∂u, ∂y/∂v [height, width, 4].
+
+    Raises:
+        ValueError: as for `rays`.
+    """
+    shape = (camera.height_px, camera.width_px)
+    v, u = np.mgrid[: shape[0], : shape[1]].astype(np.float64)
+    flat = rays(camera, np.column_stack([u.ravel(), v.ravel()]))[:, :2]
+    distorted_by_flat = _distort(_lens_of(camera), flat)[1]
+    slopes = np.linalg.inv(camera.matrix[:2, :2] @ distorted_by_flat)
+    return flat.reshape(*shape, 2), slopes.reshape(*shape, 4).astype(np.float32)
+
+
 def undistorted(camera: Camera) -> bool:
     """Whether pixels are straight images of rays: a plain pinhole, whatever its model is called."""
     return camera.distortion_model != "equidistant" and not np.any(camera.distortion)
