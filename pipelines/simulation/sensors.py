@@ -121,7 +121,8 @@ def imu_channel(
 
     ω_imu = imu_r_body ω and f = imu_r_world (a + g), with a the acceleration of the IMU's place and g =
     9.80665 m/s² upwards: at rest and level it feels +g on z. Each has its errors (`noise.measured`), and
-    `GyroBias` faults add to the angular velocity.
+    `GyroBias` faults add to the angular velocity. The motion must have true accelerations: those of
+    `Waypoints` are zero.
     """
     plan, dice, state = _observed(motion, imu.timing, start_ns, seed, stream, imu.position_m)
     rate_hz = imu.timing.rate_hz
@@ -457,11 +458,12 @@ def distance_to_ground(points_m: Floats, ways: Floats, ground: Ground = level_gr
     """Distances [n] from points [n, 3] along unit vectors [n, 3] to the ground; infinite where it is not met.
 
     Solves z_p + d z_w = ground(x_p + d x_w, y_p + d y_w) by fixed-point iteration, which converges where the
-    ray falls more steeply than the ground does.
+    ray falls more steeply than the ground does. That the ground found is the nearest is checked at 64 places.
 
     Raises:
-        ValueError: a point is not above the ground, or the iteration does not converge.
+        ValueError: a point is not above the ground, or the ground is steeper than its ray.
     """
+    rugged = ValueError("the ground is steeper than the camera's axis: tilt it less or take a smoother relief")
     clearance = points_m[:, 2] - ground(points_m[:, 0], points_m[:, 1])
     if not np.all(clearance > 0):
         raise ValueError(f"a camera is {-np.min(clearance):g} m below the ground: lift its mount or the vehicle")
@@ -475,7 +477,11 @@ def distance_to_ground(points_m: Floats, ways: Floats, ground: Ground = level_gr
         if np.all(np.abs(step) <= 1e-12 * (1 + np.abs(distance))):
             break
     else:
-        raise ValueError("the ground is steeper than the camera's axis: tilt it less or take a smoother relief")
+        raise rugged
+    for share in (np.arange(64) + 0.5) / 64:
+        passed = start + share * distance[:, None] * way
+        if np.any(passed[:, 2] < ground(passed[:, 0], passed[:, 1])):
+            raise rugged
     found = np.full(len(points_m), np.inf)
     found[falls] = distance
     return found

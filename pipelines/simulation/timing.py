@@ -120,7 +120,7 @@ def schedule(
     kept = np.flatnonzero(sent)
     number = _shown(sent, during(of_kind(faults, DuplicateFrames), t_s))[kept]
     stamp_ns = (taken_ns + _whole_ns(late_s + jitter_s + clock_s))[kept]
-    received_ns = np.maximum.accumulate((taken_ns + _whole_ns(late_s + delay_s))[kept])
+    received_ns = (taken_ns + _whole_ns(late_s + delay_s))[kept]
     for fault in of_kind(faults, SwappedStamps):
         stamp_ns = _swapped(stamp_ns, np.flatnonzero(during([fault], t_s[kept])))
 
@@ -131,7 +131,7 @@ def schedule(
         t_s=frozen(t_s),
         number=frozen(np.repeat(_swapped(number, pairs), twice)),
         stamp_ns=frozen(np.repeat(_swapped(stamp_ns, pairs), twice)),
-        received_ns=frozen(_rising(np.repeat(received_ns, twice))),
+        received_ns=frozen(_queued(np.repeat(received_ns, twice))),
     )
 
 
@@ -175,7 +175,7 @@ def _swapped(values: Longs, places: Longs) -> Longs:
     return swapped
 
 
-def _rising(times_ns: Longs) -> Longs:
-    """Never falling times, moved on so that each is at least 1 ns after the one before."""
+def _queued(times_ns: Longs) -> Longs:
+    """The times at which messages leave a queue that they come to at `times_ns`: 1 ns or more apart, in order."""
     steps = np.arange(len(times_ns))
     return np.maximum.accumulate(times_ns - steps) + steps
