@@ -404,7 +404,8 @@ def simulate(
     from workbench.settings import SettingsError
 
     if listed:
-        print("\n".join(table(("scenario", "what it shows"), [(n, scenarios.about(n)) for n in scenarios.names()])))
+        width = max(map(len, scenarios.names()))
+        print("\n".join(f"{name:<{width}}  {scenarios.about(name)}" for name in scenarios.names()))
         return
     if scenario is None:
         raise SettingsError("name a scenario, or a TOML file; workbench simulate --list names all")

@@ -172,7 +172,7 @@ def _table(kind: type, section: Any, path: str) -> Iterator[str]:
         elif value is None:
             yield f"# {key}: {meaning}; not set"
         else:
-            yield f"# {meaning}"
+            yield f"# {meaning.partition('. ')[0]}"
             yield to_toml({key: _plain(value)}).strip()
     for key, value in inner:
         below = f"{path}.{key}" if path else key
