@@ -214,69 +214,6 @@ def test_gravel_has_the_contrast_of_gravel() -> None:
 
 # ---------------------------------------------------------------------------- trajectories
 
-CURVES = {
-    "line": ways.line(0.4),
-    "circle": ways.circle(),
-    "eight": ways.figure_eight(),
-    "spiral": ways.spiral(),
-    "serpentine": ways.serpentine(),
-}
-
-
-@pytest.mark.parametrize("curve", CURVES.values(), ids=CURVES)
-def test_tangents_are_the_derivatives_of_the_points(curve: ways.Curve) -> None:
-    t, h = np.linspace(0.1, 7, 50), 1e-5
-    difference = (curve.point(t + h) - curve.point(t - h)) / (2 * h)
-    np.testing.assert_allclose(curve.tangent(t), difference, atol=1e-8)
-
-
-@pytest.mark.parametrize("curve", CURVES.values(), ids=CURVES)
-def test_arc_lengths_and_headings_are_exact(curve: ways.Curve) -> None:
-    lengths = np.random.default_rng(0).uniform(-0.005, 0.025, 300)
-    poses = ways.follow(curve, lengths)
-    # the same way in one piece, and in steps twenty times as short
-    np.testing.assert_allclose(ways.follow(curve, np.repeat(lengths / 20, 20))[::20], poses, atol=1e-11)
-    fine = ways.follow(curve, np.full(5000, lengths.sum() / 5000))
-    np.testing.assert_allclose(fine[-1], poses[-1], atol=1e-10)
-    chords = np.linalg.norm(np.diff(fine[:, :2], axis=0), axis=1).sum()
-    assert chords == pytest.approx(abs(lengths.sum()), rel=1e-6)
-    mid = (fine[:-1, 2] + fine[1:, 2]) / 2
-    step = np.diff(fine[:, :2], axis=0)
-    across = np.cos(mid) * step[:, 1] - np.sin(mid) * step[:, 0]
-    assert np.max(np.abs(across)) < 1e-9
-
-
-def test_a_drive_rises_from_standstill_to_its_speed() -> None:
-    poses = ways.drive(ways.figure_eight(), 2111, speed_mps=0.51, rng=np.random.default_rng(0))
-    speeds = 60 * np.linalg.norm(np.diff(poses[:, :2], axis=0), axis=1)
-    assert speeds[0] == 0
-    assert speeds[100:].mean() == pytest.approx(0.51, rel=0.03)
-    assert speeds[100:].std() == pytest.approx(0.051, rel=0.25)
-    assert np.all(np.abs(np.diff(poses[:, 2])) < 0.02)
-
-
-def test_fast_drives_have_slow_waves() -> None:
-    poses = ways.drive(ways.line(), 600, speed_mps=8 / 3.6, rng=np.random.default_rng(0), ramp_frames=0)
-    speeds = 60 * np.diff(poses[:, 0])
-    assert speeds.max() == pytest.approx(8 / 3.6 * 1.035, rel=1e-3)
-    assert np.abs(np.diff(speeds)).max() < 0.005
-
-
-def test_the_lever_moves_the_camera_ahead() -> None:
-    poses = ways.ahead(np.array([[1.0, 2.0, np.pi / 2]]), 0.1)
-    np.testing.assert_allclose(poses, [[1.0, 2.1, np.pi / 2]], atol=1e-15)
-
-
-def test_image_motion_integrates_to_the_poses() -> None:
-    poses = ways.drive(ways.spiral(), 400, speed_mps=0.5, rng=np.random.default_rng(1), lever_m=0.1)
-    shift, turn = ways.image_motion(poses, W)
-    pose = poses[0].copy()
-    for (u, v), delta in zip(shift, turn, strict=True):
-        pose[2] += delta
-        cos, sin = np.cos(pose[2]), np.sin(pose[2])
-        pose[:2] -= W * np.array([cos * u + sin * v, sin * u - cos * v])
-    np.testing.assert_allclose(pose, poses[-1], atol=1e-12)
-
 
 def test_image_motion_is_what_the_renderer_shows() -> None:
     poses = np.array([[0.3, 0.1, 0.5], [0.3 + 6.3 * W, 0.1 - 3.1 * W, 0.55]])

@@ -22,7 +22,8 @@ from pipelines.simulation.channels import rng_of
 
 Floats = NDArray[np.float64]
 
-_NODES, _WEIGHTS = np.polynomial.legendre.leggauss(8)
+# a Gauss-Legendre rule of eight nodes, and the end of the interval with no weight: its speed is needed too
+_NODES, _WEIGHTS = (np.append(rule, end) for rule, end in zip(np.polynomial.legendre.leggauss(8), (1, 0), strict=True))
 _CLOSE_M = 1e-9  # a curve is closed when its ends meet so closely
 
 
@@ -103,7 +104,7 @@ class SmoothCurve(Curve):
         edges = _refined(self, np.linspace(0.0, self.end, 1 + math.ceil(self.end / self.panel)))
         return math.fsum(_arc_lengths(self, edges[:-1], edges[1:]))
 
-    def measured(self, start_m: float, stop_m: float) -> ArcLength:
+    def measured(self, start_m: float, stop_m: float) -> Callable[[Floats], Frenet]:
         """The curve by its arc length, for arc lengths from `start_m` to `stop_m`."""
         return ArcLength(self, start_m, stop_m)
 
@@ -143,11 +144,11 @@ class ArcLength:
         # a cubic through both ends with the right slopes is a good first guess
         x = target / length
         first, last = self._pace[k] * length, self._pace[k + 1] * length
-        t = start + x * (first + x * (3 * width - 2 * first - last + x * (first + last - 2 * width)))
+        t: Floats = start + x * (first + x * (3 * width - 2 * first - last + x * (first + last - 2 * width)))
         active = np.ones(np.shape(s_m), dtype=bool)
         for _ in range(20):
-            missing = target - _arc_lengths(self._curve, start, t)
-            step = np.where(active, missing / _norm(self._curve.derivative(t, 1)), 0.0)
+            length, speed = _arc(self._curve, start, t)
+            step = np.where(active, (target - length) / speed, 0.0)
             t = t + step
             active &= np.abs(step) > 1e-9 * width  # Newton squares the error: the next step would be nothing
             if not active.any():
@@ -171,18 +172,23 @@ class ArcLength:
 
     def _panel(self, s_m: Floats) -> NDArray[np.intp]:
         """Numbers [n] of the panels where arc lengths [n] lie."""
-        return np.clip(np.searchsorted(self._s, s_m, side="right") - 1, 0, len(self._s) - 2)
+        k: NDArray[np.intp] = np.searchsorted(self._s, s_m, side="right") - 1
+        return np.minimum(np.maximum(k, 0), len(self._s) - 2)
 
 
 def _norm(vectors: Floats) -> Floats:
     return np.asarray(np.sqrt(vectors[0] ** 2 + vectors[1] ** 2))
 
 
-def _arc_lengths(curve: Curve, start: Floats, stop: Floats) -> Floats:
-    """Signed arc lengths [n] between parameters [n], by one Gauss-Legendre rule each."""
+def _arc(curve: Curve, start: Floats, stop: Floats) -> tuple[Floats, Floats]:
+    """Signed arc lengths [n] between parameters [n], by one Gauss-Legendre rule each, and |p'| at the end [n]."""
     half = (stop - start) / 2
     speeds = _norm(curve.derivative(start[:, None] + half[:, None] * (1 + _NODES), 1))
-    return np.asarray(half * (speeds * _WEIGHTS).sum(-1))
+    return half * (speeds * _WEIGHTS).sum(-1), speeds[:, -1]
+
+
+def _arc_lengths(curve: Curve, start: Floats, stop: Floats) -> Floats:
+    return _arc(curve, start, stop)[0]
 
 
 def _refined(curve: Curve, edges: Floats) -> Floats:
@@ -211,7 +217,7 @@ def _panels(curve: SmoothCurve, sign: int, reach_m: float) -> Floats:
         return edges[0]
     while n == 0 or (abs(length) < abs(reach_m) and n < last):
         more = int(min(n + 32, last))
-        block = _refined(curve, np.arange(n, more + 1) * (sign * curve.panel))
+        block = _refined(curve, np.arange(n, more + 1, dtype=np.float64) * (sign * curve.panel))
         length += float(np.sum(_arc_lengths(curve, block[:-1], block[1:])))
         edges.append(block[1:])
         n = more
@@ -250,20 +256,22 @@ class Waves(SmoothCurve):
         origin: tuple[float, float] = (0.0, 0.0),
         end: float = math.inf,
     ) -> None:
-        self._waves, self._drift, self._origin = tuple(waves), drift, origin
+        self._waves = tuple((wave.omega, np.array(wave.cosine), np.array(wave.sine)) for wave in waves)
+        self._drift, self._origin = np.array(drift), np.array(origin)
         self.end, self.closed = end, math.isfinite(end)
-        self.panel = math.pi / 4 / max((wave.omega for wave in self._waves), default=1.0)
+        self.panel = math.pi / 4 / max((wave.omega for wave in waves), default=1.0)
 
     def derivative(self, t: Floats, order: int) -> Floats:
         """The derivative of that order by the parameter: [2, ...]."""
-        straight = (t, 1.0, 0.0, 0.0)[order]
-        out = np.empty((2, *np.shape(t)))
-        for axis in range(2):
-            out[axis] = self._drift[axis] * straight + (self._origin[axis] if order == 0 else 0.0)
+        straight = (t, np.ones_like(t), np.zeros_like(t), np.zeros_like(t))[order]
+        out: Floats = np.multiply.outer(self._drift, straight)
+        if order == 0:
+            out += self._origin.reshape(2, *[1] * np.ndim(t))
         for omega, cosine, sine in self._waves:
             cos, sin = _quarter_turns(omega * t, order)
-            for axis in range(2):
-                out[axis] += omega**order * (cosine[axis] * cos + sine[axis] * sin)
+            size = omega**order
+            out += np.multiply.outer(size * cosine, cos)
+            out += np.multiply.outer(size * sine, sin)
         return out
 
 
@@ -356,6 +364,11 @@ class Pieces(Curve):
     def length_m(self) -> float:
         """Length of all pieces."""
         return float(self._s[-1])
+
+    @property
+    def joints_m(self) -> Floats:
+        """Arc lengths [n + 1] where pieces begin and the last one ends."""
+        return self._s.copy()
 
     def measured(self, start_m: float, stop_m: float) -> Callable[[Floats], Frenet]:
         """The curve by its arc length; it is known for any."""
@@ -467,7 +480,7 @@ def square(side_m: float = 2.0, corner_m: float = 0.3, ease: float = 0.0) -> Cur
 
 
 def figure_eight(length_m: float = 3.45, width_m: float = 1.37) -> Curve:
-    """The figure eight (length sin t, width sin 2t) of the paper's test, 18 m a round; it crosses itself."""
+    """The figure eight (length sin t, width sin 2t) of the paper's test, 19 m a round; it crosses itself."""
     _demand(length_m != 0 and width_m != 0, f"a figure eight of {length_m} m by {width_m} m")
     return Waves(
         [Wave(1.0, (0.0, 0.0), (length_m, 0.0)), Wave(2.0, (0.0, 0.0), (0.0, width_m))],
@@ -508,7 +521,7 @@ def wander(amplitude_m: float = 0.6, wavelength_m: float = 6.0, n_waves: int = 5
     return Waves(waves, drift=(1.0, 0.0), origin=(0.0, -size * float(np.sin(phases).sum())))
 
 
-def hypotrochoid(size_m: float = 1.5, petals: int = 5, winding: int = 2, loop: float = 0.9) -> Curve:
+def hypotrochoid(size_m: float = 1.5, petals: int = 5, winding: int = 2, loop: float = 0.2) -> Curve:
     """A closed star or rosette of `petals` loops that crosses itself, about the origin from (size, 0).
 
     p = size/(1 + loop) (exp(i w t) + loop exp(-i (n - w) t)) for n petals and winding w.

@@ -377,7 +377,7 @@ def _pulses(pulses: Sequence[tuple[Pulse, float]], t_s: Floats, inside: NDArray[
 def _times(t_s: Floats, duration_s: float) -> tuple[Floats, NDArray[np.bool_], Floats]:
     """Times [n] as an array, which of them lie within the motion, and the nearest that do."""
     t_s = np.asarray(t_s, dtype=np.float64)
-    return t_s, (t_s >= 0) & (t_s <= duration_s), np.clip(t_s, 0.0, duration_s)
+    return t_s, (t_s >= 0) & (t_s <= duration_s), np.minimum(np.maximum(t_s, 0.0), duration_s)
 
 
 def _signals(signals: Iterable[Signal | float], t_s: Floats, inside: NDArray[np.bool_]) -> list[Derivatives]:
@@ -421,7 +421,7 @@ def _demand_smooth(before: Kinematics, after: Kinematics, part: int) -> None:
         if np.max(np.abs(old - new)) > JOINT:
             raise ValueError(
                 f"part {part} of the chain begins with another {what} than the one before ends with "
-                f"({_text(new)} against {_text(old)}): join motions at a standstill, and let signals sway the whole chain"
+                f"({_text(new)} against {_text(old)}): join motions at a standstill, let signals sway the chain"
             )
 
 

@@ -120,14 +120,13 @@ class Mount:
 
 def rotations(heading_rad: Floats, pitch_rad: Floats, roll_rad: Floats) -> Floats:
     """`world_r_body` [n, 3, 3] = Rz(heading) Ry(pitch) Rx(roll) of angles [n] (or [1] for all)."""
-    h, p, r = np.broadcast_arrays(heading_rad, pitch_rad, roll_rad)
+    h, p, r = heading_rad, pitch_rad, roll_rad
     ch, sh, cp, sp, cr, sr = np.cos(h), np.sin(h), np.cos(p), np.sin(p), np.cos(r), np.sin(r)
-    rows = [
-        [ch * cp, ch * sp * sr - sh * cr, ch * sp * cr + sh * sr],
-        [sh * cp, sh * sp * sr + ch * cr, sh * sp * cr - ch * sr],
-        [-sp, cp * sr, cp * cr],
-    ]
-    return np.moveaxis(np.array(rows), -1, 0)
+    out = np.empty((*np.broadcast_shapes(h.shape, p.shape, r.shape), 3, 3))
+    out[:, 0, 0], out[:, 0, 1], out[:, 0, 2] = ch * cp, ch * sp * sr - sh * cr, ch * sp * cr + sh * sr
+    out[:, 1, 0], out[:, 1, 1], out[:, 1, 2] = sh * cp, sh * sp * sr + ch * cr, sh * sp * cr - ch * sr
+    out[:, 2, 0], out[:, 2, 1], out[:, 2, 2] = -sp, cp * sr, cp * cr
+    return out
 
 
 # Written out term by term, so that the last digit does not depend on how many times are asked for at once.
