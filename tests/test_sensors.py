@@ -28,8 +28,8 @@ from readers.streams import Camera, Sample
 START_NS = 1_700_000_000_123_456_789
 G = 9.80665
 PLAN = {"start_ns": START_NS, "seed": 4}
-QUIET_IMU = {"gyro_density": 0.0, "force_density": 0.0}
-QUIET_WHEELS = {"speed_density": 0.0, "turn_density": 0.0}
+QUIET_IMU = {"gyro_density": 0.0, "force_density": 0.0, "sampling": "instant"}
+QUIET_WHEELS = {"speed_density": 0.0, "turn_density": 0.0, "sampling": "instant"}
 
 
 class Round:
@@ -54,6 +54,30 @@ class Round:
             angular_velocity_radps=np.column_stack([zero, zero, rate]),
             angular_acceleration_radps2=np.column_stack([zero, zero, change]),
             heading_rad=turn,
+        )
+
+
+class Weave:
+    """A drive along x = a t, y = b sin(c t), its heading along the way."""
+
+    duration_s = 7.0
+
+    def at(self, t_s: np.ndarray) -> Kinematics:
+        t, zero = np.asarray(t_s, dtype=float), np.zeros(len(t_s))
+        a, b, c = 0.8, 0.6, 1.1
+        vy, ay, jerk = b * c * np.cos(c * t), -b * c**2 * np.sin(c * t), -b * c**3 * np.cos(c * t)
+        heading, square = np.arctan2(vy, a), a**2 + vy**2
+        rate = a * ay / square
+        change = a * jerk / square - 2 * rate * vy * ay / square
+        return Kinematics(
+            t_s=t,
+            position_m=np.column_stack([a * t, b * np.sin(c * t), zero]),
+            world_r_body=rotations(heading, zero, zero),
+            velocity_mps=np.column_stack([zero + a, vy, zero]),
+            acceleration_mps2=np.column_stack([zero, ay, zero]),
+            angular_velocity_radps=np.column_stack([zero, zero, rate]),
+            angular_acceleration_radps2=np.column_stack([zero, zero, change]),
+            heading_rad=heading,
         )
 
 
@@ -389,8 +413,9 @@ def strapdown(found: list[Any], start: Kinematics, world_r_imu: np.ndarray) -> t
     return turn.as_matrix(), place
 
 
-@pytest.mark.parametrize("motion", [Round(b=0.3), Tumble()], ids=["round", "tumble"])
-def test_imu_samples_integrate_to_the_truth_at_second_order(motion: Any) -> None:
+@pytest.mark.parametrize("sampling", ["mean", "instant"])
+@pytest.mark.parametrize("motion", [Round(b=0.3), Weave(), Tumble()], ids=["round", "weave", "tumble"])
+def test_imu_samples_integrate_to_the_truth_at_second_order(motion: Any, sampling: str) -> None:
     lever, angles = (0.3, -0.2, 0.5), (0.4, -0.3, 0.2)
     body_r_imu = looking(np.eye(3), yaw_rad=0.4, pitch_rad=-0.3, roll_rad=0.2)
     start, end = (motion.at(np.array([t])).at_point(np.array(lever)) for t in (0.0, motion.duration_s))
@@ -403,6 +428,44 @@ def test_imu_samples_integrate_to_the_truth_at_second_order(motion: Any) -> None
     assert moved < 5e-3
     assert moved / moved_fine == pytest.approx(4, rel=0.05)
     assert turned < 1e-12 or turned / turned_fine == pytest.approx(4, rel=0.05)
+
+
+def test_a_mean_sample_is_the_mean_of_the_instants_in_its_interval() -> None:
+    motion, lever = Round(b=0.4), (0.4, -0.3, 0.7)
+    means = imu(motion, timing=Timing(rate_hz=4.0), position_m=lever, **QUIET_IMU | {"sampling": "mean"})
+    fine = (np.arange(3200) + 0.5) / 400
+    state = motion.at(fine).at_point(np.array(lever))
+    for k, sample in enumerate(means):
+        window = np.abs(fine - k / 4) < 0.125  # half as long at both ends
+        assert window.sum() == (50 if k in (0, 32) else 100)
+        here = motion.at(np.array([k / 4])).world_r_body[0]
+        expected = here.T @ (state.acceleration_mps2[window].mean(axis=0) + np.array([0, 0, G]))
+        np.testing.assert_allclose(sample.linear_acceleration_mps2, expected, atol=1e-4)
+        expected = state.angular_velocity_radps[window].mean(axis=0)
+        np.testing.assert_allclose(sample.angular_velocity_radps, expected, atol=1e-5)
+
+
+def test_mean_samples_miss_nothing_of_a_jerky_drive() -> None:
+    rng = np.random.default_rng(5)
+    x, heading = np.cumsum(rng.uniform(0, 0.1, 241)), np.cumsum(rng.normal(0, 0.01, 241))
+    jerky = Waypoints(np.arange(241) / 60, np.column_stack([x - x[0], 0 * x, 0 * x]))
+    coarse = Timing(rate_hz=7.25)
+    driven = wheels(jerky, timing=coarse, **QUIET_WHEELS | {"sampling": "mean"})[-1]
+    np.testing.assert_allclose(driven.position_m, [x[-1] - x[0], 0, 0], atol=1e-12)
+    felt = imu(jerky, timing=coarse, **QUIET_IMU | {"sampling": "mean"})
+    pushes = np.trapezoid(column(felt, "linear_acceleration_mps2")[:, 0], np.arange(30) / 7.25)
+    assert pushes == pytest.approx(-(x[1] - x[0]) * 60, abs=1e-9)  # it ends at rest
+    turning = Waypoints(np.arange(241) / 60, np.column_stack([0 * x, 0 * x, heading]))
+    turned = imu(turning, timing=coarse, **QUIET_IMU | {"sampling": "mean"})
+    angle = np.trapezoid(column(turned, "angular_velocity_radps")[:, 2], np.arange(30) / 7.25)
+    assert angle == pytest.approx(heading[-1] - heading[0], abs=1e-12)
+    instants = wheels(jerky, timing=coarse, **QUIET_WHEELS)[-1]
+    assert abs(instants.position_m[0] - driven.position_m[0]) > 0.05
+
+
+def test_a_mission_of_one_moment_has_samples() -> None:
+    moment = Waypoints(np.zeros(1), np.zeros((1, 3)))
+    np.testing.assert_allclose(imu(moment, gyro_density=0.0, force_density=0.0)[0].linear_acceleration_mps2, [0, 0, G])
 
 
 SEEDS = range(300)
@@ -519,23 +582,26 @@ def test_the_odometer_does_not_feel_a_sideslip() -> None:
     np.testing.assert_allclose(last.position_m, [math.cos(0.2) * 3.98, 0, 0], atol=1e-9)
 
 
-def test_odometer_samples_integrate_to_the_truth_at_second_order() -> None:
-    motion = Round(b=0.3)
+@pytest.mark.parametrize("sampling", ["mean", "instant"])
+def test_odometer_samples_integrate_to_the_truth_at_second_order(sampling: str) -> None:
+    motion = Weave()
     errors = []
-    for rate_hz in (10.0, 20.0):
-        last = wheels(motion, timing=Timing(rate_hz=rate_hz), **QUIET_WHEELS)[-1]
-        end = motion.at(np.array([motion.duration_s]))
-        heading_error = np.sin(heading_of_quat(last.quat_xyzw) - end.heading_rad[0])
-        errors.append([np.linalg.norm(last.position_m[:2] - end.position_m[0, :2]), abs(heading_error)])
+    for rate_hz in (20.0, 40.0):
+        last = wheels(motion, timing=Timing(rate_hz=rate_hz), **QUIET_WHEELS | {"sampling": sampling})[-1]
+        start, end = (motion.at(np.array([t])) for t in (0.0, motion.duration_s))
+        reckoned = start.position_m[0] + start.world_r_body[0] @ last.position_m
+        turned = heading_of_quat(last.quat_xyzw) - (end.heading_rad - start.heading_rad)[0]
+        errors.append([np.linalg.norm(reckoned - end.position_m[0]), abs(turned)])
     (moved, turned), (moved_fine, turned_fine) = errors
     assert moved < 0.02
     assert moved / moved_fine == pytest.approx(4, rel=0.05)
-    assert turned / turned_fine == pytest.approx(4, rel=0.05)
+    assert turned < 1e-12 or turned / turned_fine == pytest.approx(4, rel=0.05)
 
 
-def test_a_steady_arc_is_reckoned_exactly() -> None:
+@pytest.mark.parametrize("sampling", ["mean", "instant"])
+def test_a_steady_arc_is_reckoned_exactly(sampling: str) -> None:
     motion = Round()
-    found = wheels(motion, timing=Timing(rate_hz=2.0), **QUIET_WHEELS)
+    found = wheels(motion, timing=Timing(rate_hz=2.0), **QUIET_WHEELS | {"sampling": sampling})
     truth = motion.at(times_s(found))
     np.testing.assert_allclose(column(found, "position_m")[:, :2], truth.position_m[:, :2], atol=1e-12)
     told = Rotation.from_quat(column(found, "quat_xyzw")).as_matrix()
@@ -970,10 +1036,12 @@ BAD = [
     (Imu, {"force_walk": -1.0}),
     (Imu, {"gyro_bias_radps": (0.0, math.nan, 0.0)}),
     (Imu, {"orientation_noise_rad": -0.1}),
+    (Imu, {"sampling": "median"}),
     (Odometer, {"speed_density": -1.0}),
     (Odometer, {"tick_m": -0.1}),
     (Odometer, {"track_m": 0.0}),
     (Odometer, {"message": "text"}),
+    (Odometer, {"sampling": "median"}),
     (Reference, {"position_noise_m": -1.0}),
     (Reference, {"with_covariance": True}),
     (Height, {"noise_m": -1.0}),
