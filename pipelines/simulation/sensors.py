@@ -129,7 +129,7 @@ def imu_channel(
 
     ω_imu = imu_r_body ω and f = imu_r_world (a + g), with a the acceleration of the IMU's place and g =
     9.80665 m/s² upwards: at rest and level it feels +g on z. As means, a and ω are the change of velocity and
-    the turn of the interval by its length, in the axes of the sample's time. Each has its errors
+    the turn within the interval, divided by its length, in the axes of the sample's time. Each has its errors
     (`noise.measured`), and `GyroBias` faults add to the angular velocity.
     """
     plan, dice, state = _observed(motion, imu.timing, start_ns, seed, stream, imu.position_m)
@@ -630,7 +630,7 @@ def tracks_channel(
     channel ``id`` with the tracks' ids in the same order.
 
     Raises:
-        ValueError: a slip of a landmark that there is not; landmarks of another shape.
+        ValueError: a slip of a landmark that there is not or that is not seen then; landmarks of another shape.
     """
     landmarks = np.array(landmarks_m, dtype=np.float64)
     if landmarks.ndim != 2 or landmarks.shape[1] != 3:
@@ -684,14 +684,17 @@ class _Views:
 
 
 def _slipped(slip: TrackSlip, views: _Views, landmarks: Floats, t_s: Floats) -> tuple[TrackSlip, Floats]:
-    """A slip and the point [3] that takes the landmark's place, which is its own if it is not seen then."""
+    """A slip and the point [3] that takes the landmark's place."""
     if not 0 <= slip.track < len(landmarks):
         raise ValueError(f"{slip.name}: track is {slip.track}, there are {len(landmarks)} landmarks, counted from 0")
     landmark = landmarks[slip.track]
     for number in np.flatnonzero(during([slip], t_s)).tolist():
         if _within(views.camera, views.pixels(number, landmark[None]))[0]:
             return slip, views.beside(number, landmark, np.array(slip.offset_px))
-    return slip, landmark
+    raise ValueError(
+        f"{slip.name}: landmark {slip.track} is not seen from {slip.start_s} s to {slip.stop_s} s, so that it cannot "
+        "slip: choose another track or time"
+    )
 
 
 def _within(camera: Camera, pixels: Floats) -> NDArray[np.bool_]:
