@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 
 import numpy as np
 
@@ -25,3 +25,14 @@ def check(settings: object, rule: str, *names: str) -> None:
         value = getattr(settings, name)
         if not all(np.isfinite(x) and _RULES[rule](float(x)) for x in np.ravel(value)):
             raise ValueError(f"{type(settings).__name__}: {name} is {value!r}, it must be {rule}")
+
+
+def check_word(settings: object, name: str, words: Sequence[str]) -> None:
+    """Demand that a field of `settings` is one of some words.
+
+    Raises:
+        ValueError: it is not.
+    """
+    value = getattr(settings, name)
+    if value not in words:
+        raise ValueError(f"{type(settings).__name__}: {name} is {value!r}, it must be one of {', '.join(words)}")

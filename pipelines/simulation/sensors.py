@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Any, Literal
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +24,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.geometry import from_local_enu
 from pipelines.simulation.channels import Channel, rng_of
-from pipelines.simulation.checks import check
+from pipelines.simulation.checks import check, check_word
 from pipelines.simulation.faults import (
     FAULTS_STREAM,
     Fault,
@@ -60,6 +60,10 @@ from readers.streams import (
 
 Floats = NDArray[np.float64]
 Triple = tuple[float, float, float]
+Sampling = Literal["mean", "instant"]
+"""A sample is the mean over the interval between two of them, its time in the middle, as sensors that count
+or integrate give it: the trapezoids over the samples are then the truth's own, whatever happens in between.
+Or it is the value of the instant, which a motion with jumps in its acceleration can hide much between."""
 Ground = Callable[[Floats, Floats], Floats]
 """Height of the ground in m [n] at world x and y in m, each [n]."""
 
@@ -68,6 +72,7 @@ HEIGHT, CALIBRATION, TRACKS, GNSS = "/camera/height", "/camera/camera_info", "/c
 WORLD_FRAME, ODOMETRY_FRAME, BODY_FRAME = "world", "odom", "base_link"
 IMU_FRAME, CAMERA_FRAME, GNSS_FRAME = "imu", "camera", "gnss"
 
+SAMPLINGS = ("mean", "instant")
 GRAVITY_MPS2 = np.array([0.0, 0.0, 9.80665])  # what an accelerometer at rest feels, upwards
 
 
@@ -80,6 +85,7 @@ class Imu:
 
     Attributes:
         timing: when it measures.
+        sampling: what a sample is, see `Sampling`.
         position_m: where it sits in the body.
         yaw_pitch_roll_rad: its axes in the body.
         gyro_density: white noise of the angular velocity, rad/s/√Hz; the default is paper B's Table 1.
@@ -95,6 +101,7 @@ class Imu:
     """
 
     timing: Timing = Timing(rate_hz=100.0)
+    sampling: Sampling = "mean"
     position_m: Triple = (0.0, 0.0, 0.0)
     yaw_pitch_roll_rad: Triple = (0.0, 0.0, 0.0)
     gyro_density: float = 1e-3
@@ -112,6 +119,7 @@ class Imu:
         check(self, "0 or more", "gyro_density", "gyro_walk", "force_density", "force_walk", "orientation_noise_rad")
         check(self, "a finite number", "position_m", "yaw_pitch_roll_rad", "gyro_bias_radps", "gyro_scale")
         check(self, "a finite number", "force_bias_mps2", "force_scale")
+        check_word(self, "sampling", SAMPLINGS)
 
 
 def imu_channel(
@@ -120,16 +128,17 @@ def imu_channel(
     """Angular velocity and specific force at the IMU's place, in its axes.
 
     ω_imu = imu_r_body ω and f = imu_r_world (a + g), with a the acceleration of the IMU's place and g =
-    9.80665 m/s² upwards: at rest and level it feels +g on z. Each has its errors (`noise.measured`), and
-    `GyroBias` faults add to the angular velocity. The motion must have true accelerations: those of
-    `Waypoints` are zero.
+    9.80665 m/s² upwards: at rest and level it feels +g on z. As means, a and ω are the change of velocity and
+    the turn within the interval, divided by its length, in the axes of the sample's time. Each has its errors
+    (`noise.measured`), and `GyroBias` faults add to the angular velocity.
     """
     plan, dice, state = _observed(motion, imu.timing, start_ns, seed, stream, imu.position_m)
     rate_hz = imu.timing.rate_hz
     body_r_imu = _mounting(imu.yaw_pitch_roll_rad)
     world_r_imu = state.world_r_body @ body_r_imu
+    felt = _felt(imu.sampling, motion, state, rate_hz, imu.position_m)
     rate = measured(
-        state.angular_velocity_radps @ body_r_imu,
+        felt.rate_radps @ body_r_imu,
         partial(dice, "gyro"),
         rate_hz,
         density=imu.gyro_density,
@@ -140,7 +149,7 @@ def imu_channel(
     for fault in of_kind(faults, GyroBias):
         rate[during([fault], plan.t_s)] += np.array(fault.bias_radps) @ body_r_imu
     force = measured(
-        _in_axes(world_r_imu, state.acceleration_mps2 + GRAVITY_MPS2),
+        _in_axes(world_r_imu, felt.acceleration_mps2 + GRAVITY_MPS2),
         partial(dice, "force"),
         rate_hz,
         density=imu.force_density,
@@ -177,6 +186,7 @@ class Odometer:
 
     Attributes:
         timing: when it measures.
+        sampling: what a sample is, see `Sampling`.
         message: ``odometry`` (nav_msgs/Odometry, with a pose) or ``twist`` (geometry_msgs/TwistStamped).
         speed_density: white noise of the forward speed, m/s/√Hz; the default is paper B's Table 1.
         speed_bias_mps: constant error of the speed.
@@ -191,6 +201,7 @@ class Odometer:
     """
 
     timing: Timing = Timing(rate_hz=50.0)
+    sampling: Sampling = "mean"
     message: Literal["odometry", "twist"] = "odometry"
     speed_density: float = 0.01
     speed_bias_mps: float = 0.0
@@ -207,8 +218,8 @@ class Odometer:
         check(self, "0 or more", "speed_density", "speed_walk", "turn_density", "turn_walk", "tick_m")
         check(self, "a finite number", "speed_bias_mps", "speed_scale", "turn_bias_radps", "turn_scale")
         check(self, "above 0", "track_m")
-        if self.message not in ("odometry", "twist"):
-            raise ValueError(f"Odometer: message is {self.message!r}, it must be 'odometry' or 'twist'")
+        check_word(self, "sampling", SAMPLINGS)
+        check_word(self, "message", ("odometry", "twist"))
 
 
 def odometer_channel(
@@ -220,7 +231,7 @@ def odometer_channel(
     faults: Sequence[Fault] = (),
     stream: str = ODOMETRY,
 ) -> Channel:
-    """Forward speed and yaw rate of the body at the moment of the measurement, as wheels tell them.
+    """Forward speed and yaw rate of the body, as wheels tell them.
 
     Speed along body x and rate about body z have their errors (`noise.measured`), `OdometerScale` faults
     multiply the speed, then the encoders count whole ticks. Wheels know no sideways motion: y and z are 0.
@@ -228,8 +239,9 @@ def odometer_channel(
     """
     plan, dice, state = _observed(motion, odometer.timing, start_ns, seed, stream)
     rate_hz = odometer.timing.rate_hz
+    felt = _felt(odometer.sampling, motion, state, rate_hz)
     speed = measured(
-        state.body_velocity_mps[:, 0],
+        felt.body_velocity_mps[:, 0],
         partial(dice, "speed"),
         rate_hz,
         density=odometer.speed_density,
@@ -238,7 +250,7 @@ def odometer_channel(
         scale=odometer.speed_scale,
     )
     turn = measured(
-        state.angular_velocity_radps[:, 2],
+        felt.rate_radps[:, 2],
         partial(dice, "turn"),
         rate_hz,
         density=odometer.turn_density,
@@ -406,8 +418,7 @@ class Height:
         check(self, "a finite number", "bias_m")
         if not self.max_range_m > self.min_range_m:
             raise ValueError(f"Height: max_range_m is {self.max_range_m!r}, it must be above min_range_m")
-        if self.direction not in ("vertical", "axis"):
-            raise ValueError(f"Height: direction is {self.direction!r}, it must be 'vertical' or 'axis'")
+        check_word(self, "direction", ("vertical", "axis"))
 
 
 def level_ground(x_m: Floats, y_m: Floats) -> Floats:
@@ -619,7 +630,7 @@ def tracks_channel(
     channel ``id`` with the tracks' ids in the same order.
 
     Raises:
-        ValueError: a slip of a landmark that there is not; landmarks of another shape.
+        ValueError: a slip of a landmark that there is not or that is not seen then; landmarks of another shape.
     """
     landmarks = np.array(landmarks_m, dtype=np.float64)
     if landmarks.ndim != 2 or landmarks.shape[1] != 3:
@@ -673,14 +684,17 @@ class _Views:
 
 
 def _slipped(slip: TrackSlip, views: _Views, landmarks: Floats, t_s: Floats) -> tuple[TrackSlip, Floats]:
-    """A slip and the point [3] that takes the landmark's place, which is its own if it is not seen then."""
+    """A slip and the point [3] that takes the landmark's place."""
     if not 0 <= slip.track < len(landmarks):
         raise ValueError(f"{slip.name}: track is {slip.track}, there are {len(landmarks)} landmarks, counted from 0")
     landmark = landmarks[slip.track]
     for number in np.flatnonzero(during([slip], t_s)).tolist():
         if _within(views.camera, views.pixels(number, landmark[None]))[0]:
             return slip, views.beside(number, landmark, np.array(slip.offset_px))
-    return slip, landmark
+    raise ValueError(
+        f"{slip.name}: landmark {slip.track} is not seen from {slip.start_s} s to {slip.stop_s} s, so that it cannot "
+        "slip: choose another track or time"
+    )
 
 
 def _within(camera: Camera, pixels: Floats) -> NDArray[np.bool_]:
@@ -724,6 +738,37 @@ def _observed(
     """When a sensor measures, its random numbers by name, and how its point of the body moves then."""
     plan = schedule(timing, duration_s=motion.duration_s, start_ns=start_ns, seed=seed, stream=stream)
     return plan, partial(rng_of, seed, stream), motion.at(plan.t_s).at_point(np.array(point_m))
+
+
+class _Felt(NamedTuple):
+    """What is measured of a point's motion: rates and velocity in body axes, acceleration in the world's [n, 3]."""
+
+    rate_radps: Floats
+    acceleration_mps2: Floats
+    body_velocity_mps: Floats
+
+
+def _felt(
+    sampling: Sampling, motion: Motion, state: Kinematics, rate_hz: float, point_m: Triple = (0.0, 0.0, 0.0)
+) -> _Felt:
+    """A point's motion at the times of its `state`, or the means of it over the intervals about them.
+
+    The intervals end where the motion ends. The mean velocity is along the arc: the way from end to end is
+    the chord of a steady turn φ, shorter by sin(φ/2)/(φ/2), in the axes of its middle.
+    """
+    if sampling == "instant" or motion.duration_s == 0:
+        return _Felt(state.angular_velocity_radps, state.acceleration_mps2, state.body_velocity_mps)
+    before, after = (
+        motion.at(np.clip(state.t_s + lag_s, 0.0, motion.duration_s)).at_point(np.array(point_m))
+        for lag_s in (-0.5 / rate_hz, 0.5 / rate_hz)
+    )
+    length_s = (after.t_s - before.t_s)[:, None]
+    start = Rotation.from_matrix(before.world_r_body)
+    turn = (start.inv() * Rotation.from_matrix(after.world_r_body)).as_rotvec()
+    middle = (start * Rotation.from_rotvec(turn / 2)).as_matrix()
+    chord = _in_axes(middle, after.position_m - before.position_m)
+    arc = chord / np.sinc(np.linalg.norm(turn, axis=1, keepdims=True) / (2 * np.pi))
+    return _Felt(turn / length_s, (after.velocity_mps - before.velocity_mps) / length_s, arc / length_s)
 
 
 def _channel(
