@@ -239,13 +239,18 @@ def test_unknown_and_refused_streams_are_listed_and_not_read(tmp_path: Path) -> 
         data=np.zeros(20, np.uint8),
     )
     note = make("std_msgs/msg/Bool", data=True)
+    cloud = make("sensor_msgs/msg/PointCloud", header=make.header(START_NS), points=[], channels=[])
     entries = [
+        Entry("/scan", "sensor_msgs/msg/PointCloud", START_NS, cloud),
         Entry("/depth", "sensor_msgs/msg/CompressedImage", START_NS, depth),
         Entry("/note", "std_msgs/msg/Bool", START_NS, note),
     ]
     with open_recording(write_ros1(tmp_path / "a.bag", entries)) as recording:
         assert not recording.stream("/depth").readable
         assert "compressedDepth" in recording.stream("/depth").reason
+        scan = recording.stream("/scan")
+        assert (scan.kind, scan.readable) == (StreamKind.UNKNOWN, False)
+        assert "without a channel 'id'" in scan.reason
         assert recording.stream("/note").reason == "no reader for type std_msgs/Bool"
         assert "bool data" in recording.stream("/note").definition
         assert list(recording.read()) == []

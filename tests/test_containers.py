@@ -24,6 +24,7 @@ from rosbags.typesys import Stores, get_typestore
 from ruamel.yaml import YAML
 from scipy.spatial.transform import Rotation
 
+from pipelines.simulation import faults
 from pipelines.simulation import trajectories as ways
 from pipelines.simulation.mission import POSE, SimulatedMission, nadir_camera
 from pipelines.simulation.surfaces import tiles
@@ -73,7 +74,7 @@ KINDS = {
     TextSample: StreamKind.TEXT,
     Problem: StreamKind.IMU,
 }
-FAULTS = '{"faults": [], "scenario": {"name": "Überfahrt"}}'
+FAULTS = faults.to_text([faults.MotionBlur(start_s=1.0, stop_s=1.5, exposure=0.5)], START_NS, {"name": "Überfahrt"})
 
 
 class Toy(Recording):
@@ -252,8 +253,8 @@ def moment(k: int) -> list[Sample]:
 
 
 def everything() -> list[Sample]:
-    faults = TextSample(stream="/truth/faults", t_ns=START_NS, received_ns=START_NS, text=FAULTS)
-    return [faults, *(sample for k in range(4) for sample in moment(k))]
+    listed = TextSample(stream=faults.FAULTS_STREAM, t_ns=START_NS, received_ns=START_NS, text=FAULTS)
+    return [listed, *(sample for k in range(4) for sample in moment(k))]
 
 
 @pytest.fixture(scope="module")
