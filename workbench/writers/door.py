@@ -75,7 +75,8 @@ def write(
         RecordingError: the path is taken or cannot be made, or does not say which container is meant.
         StreamError: the streams do not fit into this container as they are.
         ImageError: an image cannot be encoded in this format.
-        KeyboardInterrupt: as it came; the container holds what was written before it, and is whole.
+        KeyboardInterrupt: as it came; a whole container of what was written before it stays behind (nothing, where
+            that was too little for one).
     """
     path = Path(path)
     _check(recording, streams)

@@ -49,6 +49,7 @@ SUFFIXES = {
     "jp2": ".jp2",
 }
 CM_PER_M, KMH_PER_MPS = 100.0, 3.6
+_TRUTH_NAMES = ("truth", "reference")
 
 
 class FolderTarget(Target):
@@ -106,6 +107,15 @@ class FolderTarget(Target):
         return path
 
 
+def truest(infos: Sequence[StreamInfo]) -> list[StreamInfo]:
+    """Of several streams those whose names say that they are the truth, or else a reference; else all."""
+    found = list(infos)
+    for word in _TRUTH_NAMES:
+        if len(found) > 1 and (named := [info for info in found if word in info.name.lower()]):
+            found = named
+    return found
+
+
 # ------------------------------------------------------------------------------------ EuRoC
 
 _EUROC_CAMERAS = {"plumb_bob": "radial-tangential"}
@@ -115,11 +125,12 @@ _EUROC_HEADERS = {
     "a_RS_S_x [m s^-2],a_RS_S_y [m s^-2],a_RS_S_z [m s^-2]",
     StreamKind.POSE: "#timestamp [ns],p_RS_R_x [m],p_RS_R_y [m],p_RS_R_z [m],q_RS_w [],q_RS_x [],q_RS_y [],q_RS_z []",
 }
-_EUROC_FOLDERS = {StreamKind.IMAGE: "cam", StreamKind.IMU: "imu", StreamKind.POSE: "state_groundtruth_estimate"}
+_EUROC_FOLDERS = {StreamKind.IMAGE: "cam", StreamKind.IMU: "imu", StreamKind.POSE: "pose"}
+_EUROC_TRUTH = "state_groundtruth_estimate"
 
 
 class EurocFolder(FolderTarget):
-    """EuRoC's ASL layout: mav0/cam0, imu0, state_groundtruth_estimate0, and further ones by number."""
+    """EuRoC's ASL layout: mav0/cam0 …, imu0 …, state_groundtruth_estimate0, and pose0 … for other poses."""
 
     def __init__(self, order: Order) -> None:
         super().__init__(order)
@@ -134,21 +145,23 @@ class EurocFolder(FolderTarget):
             StreamKind.IMU: self._put_imu,
             StreamKind.POSE: self._put_pose,
         }
-        numbers = dict.fromkeys(actions, 0)
+        numbers: Counter[str] = Counter()
+        truth = truest([info for info in infos if info.kind is StreamKind.POSE])
         for info in infos:
             if info.name == FAULTS_STREAM and info.kind is StreamKind.TEXT:
                 self._put[info.name] = self._put_faults
             elif info.kind in actions:
                 self._put[info.name] = actions[info.kind]
-                self._make(info, numbers[info.kind])
-                numbers[info.kind] += 1
+                begin = _EUROC_TRUTH if [info] == truth else _EUROC_FOLDERS[info.kind]
+                self._make(info, f"{begin}{numbers[begin]}")
+                numbers[begin] += 1
             elif info.kind is StreamKind.CAMERA:
                 self.leave_out(info.name, "an EuRoC folder has one calibration a camera, in its sensor.yaml")
             else:
                 self.leave_out(info.name, f"an EuRoC folder has no place for {info.kind} streams")
 
-    def _make(self, info: StreamInfo, number: int) -> None:
-        folder = self.path / "mav0" / f"{_EUROC_FOLDERS[info.kind]}{number}"
+    def _make(self, info: StreamInfo, name: str) -> None:
+        folder = self.path / "mav0" / name
         (folder / "data" if info.kind is StreamKind.IMAGE else folder).mkdir(parents=True)
         self._folders[info.name] = folder
         self._tables[info.name] = (folder / "data.csv").open("w", encoding="utf-8", newline="\n")
@@ -235,7 +248,6 @@ def _numbers(*values: float) -> str:
 TABLE = "file.csv"
 _PAPER_HEADER = ("time [s]", "x [cm]", "y [cm]", "z [cm]", "roll [deg]", "pitch [deg]", "yaw [deg]")
 _DISTANCE, _SPEED = "distance to the surface [cm]", "speed [km/h]"
-_TRUTH_NAMES = ("truth", "reference")
 _SPEED_KINDS = (StreamKind.ODOMETRY, StreamKind.SCALAR)
 
 
@@ -285,10 +297,7 @@ class PaperFolder(FolderTarget):
 
     def _choose(self, infos: Sequence[StreamInfo], what: str, kinds: Sequence[StreamKind]) -> StreamInfo | None:
         """The only stream of these kinds, or the only one whose name says that it is the truth."""
-        found = [info for info in infos if info.kind in kinds]
-        for word in _TRUTH_NAMES:
-            if len(found) > 1 and (named := [info for info in found if word in info.name.lower()]):
-                found = named
+        found = truest([info for info in infos if info.kind in kinds])
         if len(found) > 1:
             raise StreamError(
                 f"{self.order.recording.path}: paper A's folder holds one stream of {what} and these could be it: "

@@ -7,7 +7,6 @@ and ``-Infinity``, as in the JSON form of protobuf; a matrix of a camera that is
 from __future__ import annotations
 
 import base64
-import dataclasses
 import json
 import math
 from collections.abc import Callable
@@ -18,7 +17,7 @@ from rosbags.interfaces import Nodetype
 
 from readers.images import RAW_FORMATS
 from readers.streams import CameraInfo, FloatArray, ImageSample, PoseSample, Sample
-from workbench.writers.ros_messages import Envelope, RosMessages, compressed_topic, transform_topic
+from workbench.writers.ros_messages import RosMessages, compressed_topic, transform_topic
 
 Json = dict[str, Any]
 
@@ -53,7 +52,9 @@ class JsonMessages:
         if builder is not None and (found := builder(sample, frame)) is not None:
             return found
         envelope = self._ros.build(sample, frame)
-        return _from_ros(envelope) if envelope else None
+        if envelope is None:
+            return None
+        return JsonMessage(envelope.topic, envelope.message.__msgtype__, self._plain(envelope.message))
 
     def schema(self, name: str) -> Json:
         """The JSON schema of a type."""
@@ -72,6 +73,19 @@ class JsonMessages:
             return None
         stated = {"timestamp": _stamp(sample), "frame_id": sample.parent_frame or frame}
         return JsonMessage(sample.stream, "foxglove.PoseInFrame", {**stated, "pose": where})
+
+    def _plain(self, value: Any) -> Any:
+        """A ROS message, or a part of one, as JSON."""
+        if hasattr(value, "nanosec"):
+            return {"sec": value.sec, "nsec": value.nanosec}
+        if hasattr(value, "__msgtype__"):
+            _, fields = self._ros.store.fielddefs[value.__msgtype__]
+            return {name: self._plain(getattr(value, name)) for name, _ in fields}
+        if isinstance(value, np.ndarray):
+            value = value.tolist()
+        if isinstance(value, list):
+            return [self._plain(part) for part in value]
+        return _number(value) if isinstance(value, float) else value
 
     def _ros_schema(self, name: str) -> Json:
         _, fields = self._ros.store.fielddefs[name]
@@ -159,27 +173,6 @@ def _number(value: float) -> float | str:
 
 def _base64(data: bytes | memoryview) -> str:
     return base64.b64encode(data).decode()
-
-
-# -------------------------------------------------------------------------------------- ROS
-
-
-def _from_ros(envelope: Envelope) -> JsonMessage:
-    fields: Json = _plain(envelope.message)
-    return JsonMessage(envelope.topic, envelope.message.__msgtype__, fields)
-
-
-def _plain(value: Any) -> Any:
-    """A ROS message, or a part of one, as JSON."""
-    if hasattr(value, "nanosec"):
-        return {"sec": value.sec, "nsec": value.nanosec}
-    if dataclasses.is_dataclass(value):
-        return {field.name: _plain(getattr(value, field.name)) for field in dataclasses.fields(value)}
-    if isinstance(value, np.ndarray):
-        return [_plain(part) for part in value.tolist()]
-    if isinstance(value, list):
-        return [_plain(part) for part in value]
-    return _number(value) if isinstance(value, float) else value
 
 
 # ---------------------------------------------------------------------------------- schemas
