@@ -1,6 +1,5 @@
 """What we write is opened by libraries that are not ours, and is what we had."""
 
-import runpy
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -184,23 +183,3 @@ def test_errors_name_the_thing_and_the_cure(tmp_path: Path) -> None:
         write_mcap(Given(), tmp_path / "no" / "file")
     written = write_mcap(Given(Sample(stream="/x", t_ns=1, received_ns=1)), tmp_path / "x")
     assert written.left_out == {"/x": "1 of its messages: there is no message for this kind of sample"}
-
-
-def test_the_built_in_recording_is_what_its_script_makes() -> None:
-    mission = runpy.run_path(str(DEMO / "make_demo.py"))["demo_mission"]()
-    found = decoded(DEMO / "demo.mcap")
-    assert (DEMO / "demo.mcap").stat().st_size < 4.2e6
-    assert {topic: len(m) for topic, m in found.items()} == dict.fromkeys(
-        [COMPRESSED, sim.INFO, sim.POSE, sim.HEIGHT], 300
-    )
-    poses = [(p.pose.position.x, p.pose.position.y) for p, _, _ in found[sim.POSE]]
-    np.testing.assert_allclose(poses, mission.truth_poses[:, :2], atol=1e-12)
-    for k in (30, 70, 200):
-        image = cv2.imdecode(np.frombuffer(found[COMPRESSED][k][0].data, np.uint8), cv2.IMREAD_UNCHANGED)
-        assert np.abs(image.astype(int) - mission.frame(k)).mean() < 5  # the next frame is 15 to 27 away
-    assert [(f.name, f.start, f.stop) for f in mission.faults] == [
-        ("ExposureJump", 60, 85),
-        ("RepetitivePatch", 198, 206),
-    ]
-    for fault in mission.faults:
-        assert f"frames {fault.start} to {fault.stop - 1}" in (DEMO / "make_demo.py").read_text()

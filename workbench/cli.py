@@ -381,9 +381,7 @@ def simulate(
     ] = None,
     container: Annotated[
         str | None,
-        typer.Option(
-            "--as", metavar="CONTAINER", help="mcap, mcap-json, ros1, ros2, paper-a, euroc [by suffix]."
-        ),
+        typer.Option("--as", metavar="CONTAINER", help="mcap, mcap-json, ros1, ros2, paper-a, euroc [by suffix]."),
     ] = None,
     images: Annotated[
         str | None, typer.Option(metavar="FORM", help="Images as jpeg, png or stored [jpeg; png in folders].")

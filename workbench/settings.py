@@ -254,7 +254,7 @@ def _merge_places(key: str, base: Sequence[Any], over: Mapping[str, Any]) -> lis
     merged = list(base)
     for place, value in over.items():
         if not (place.isdecimal() and int(place) < len(merged)):
-            raise SettingsError(f"{key}.{place}: {key} has {len(merged)} entries, counted from 0")
+            raise SettingsError(f"{key}.{place}: {key} has {len(merged)} entries, and the first one is {key}.0")
         below = merged[int(place)]
         merged[int(place)] = _merge(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
     return merged

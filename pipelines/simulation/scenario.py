@@ -70,7 +70,7 @@ from pipelines.simulation.signals import fluctuation
 from pipelines.simulation.speeds import SPEEDS, Speed, speed
 from pipelines.simulation.surfaces import WRAP, Surface, surface_from_image
 from pipelines.simulation.timing import schedule
-from readers.streams import Camera
+from readers.streams import Camera, RangeSample, Sample, TrackSample
 
 Floats = NDArray[np.float64]
 
@@ -269,10 +269,15 @@ def _met(scenario: Scenario, motion: Motion) -> tuple[Fault, ...]:
         )
     if scenario.camera is None:
         return scenario.faults
+    section = scenario.camera
+    with _named("camera"):
+        camera, mount, t_s = (
+            _intrinsics(section, "camera"),
+            _mount(section, NADIR),
+            section.timing.times_s(motion.duration_s),
+        )
     with _named("faults"):
-        section = scenario.camera
-        t_s = section.timing.times_s(motion.duration_s)
-        return faults_met(scenario.faults, _intrinsics(section, "camera"), _mount(section, NADIR), motion, t_s)
+        return faults_met(scenario.faults, camera, mount, motion, t_s)
 
 
 def _surface(scenario: Scenario, picture: ArrayLike | None) -> Surface:
@@ -417,7 +422,8 @@ def _channels(scenario: Scenario, motion: Motion, faults: tuple[Fault, ...]) -> 
     if scenario.height is not None and scenario.camera is not None:
         mount, relief = _mount(scenario.camera, NADIR), _relief(scenario)
         ground = level_ground if relief is None else partial(height_of, relief)
-        yield height_channel(motion, scenario.height, mount, ground=ground, **start)
+        with _named("height"):
+            yield _single_precision(height_channel(motion, scenario.height, mount, ground=ground, **start))
     if scenario.imu is not None:
         yield imu_channel(motion, scenario.imu, faults=faults, **start)
     if scenario.odometer is not None:
@@ -428,9 +434,24 @@ def _channels(scenario: Scenario, motion: Motion, faults: tuple[Fault, ...]) -> 
         camera, mount = _intrinsics(scenario.front, "front"), _mount(scenario.front, FORWARD)
         points = landmarks_of(scenario.surroundings)
         with _named("tracks"):
-            yield tracks_channel(
+            tracked = tracks_channel(
                 motion, scenario.tracks, camera, mount, points, faults=faults, stream=FRONT_TRACKS, **start
             )
+        yield _single_precision(tracked)
+
+
+def _single_precision(channel: Channel) -> Channel:
+    """The channel with ranges and pixels as their ROS messages hold them, so that a file holds the same numbers."""
+
+    def sample(number: int, t_ns: int, received_ns: int) -> Sample:
+        made = channel.sample(number, t_ns, received_ns)
+        if isinstance(made, RangeSample):
+            return replace(made, range_m=float(np.float32(made.range_m)))
+        if isinstance(made, TrackSample):
+            return replace(made, points_px=made.points_px.astype(np.float32).astype(np.float64))
+        return made
+
+    return replace(channel, sample=sample)
 
 
 def _info(
