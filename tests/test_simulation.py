@@ -17,7 +17,6 @@ from pipelines.simulation.render import expose, noise_key_of, radiance, world_h_
 from pipelines.simulation.surfaces import (
     PSF_SIGMA_PX,
     Surface,
-    gravel,
     surface_from_image,
     surface_from_periodic,
     tiles,
@@ -173,43 +172,6 @@ def test_gain_offset_vignetting_and_clipping() -> None:
     assert np.all(expose(flat, noise_key=1, gain=-1.0) == 0)
     dark = expose(flat, noise_key=1, vignetting=0.6)
     assert (dark[2, 2], dark[0, 0], dark[2, 4]) == (100, 40, 70)
-
-
-# -------------------------------------------------------------------------------- surfaces
-
-
-def test_surfaces_refuse_what_is_no_picture() -> None:
-    with pytest.raises(ValueError, match="finite grey levels"):
-        surface_from_image(np.zeros((4, 4, 3)))
-    with pytest.raises(ValueError, match="must be even"):
-        surface_from_periodic(np.zeros((5, 4)))
-
-
-def test_surface_of_an_image_is_seamless_and_mirrored() -> None:
-    surface = paper_surface()
-    assert surface.period_m == pytest.approx((1024 * W, 1024 * W))
-    at_edge = see(surface, (512 * W, -256 * W, 0.0), 64)  # the picture's right border lies in the middle
-    np.testing.assert_allclose(at_edge, see(surface, (511 * W, -256 * W, 0.0), 64)[:, ::-1], atol=0.05)
-
-
-@pytest.mark.parametrize("make", [lambda rng: gravel(256, rng), lambda rng: tiles(32, rng)], ids=["gravel", "tiles"])
-def test_procedural_surfaces_are_seeded_and_periodic(make) -> None:
-    surface, again, other = (make(np.random.default_rng(seed)) for seed in (1, 1, 2))
-    assert np.array_equal(surface.coefficients, again.coefficients)
-    assert not np.array_equal(surface.coefficients, other.coefficients)
-    here = see(surface, (0.0, 0.0, 0.0), 128)
-    np.testing.assert_allclose(see(surface, (surface.period_m[0], 0.0, 0.0), 128), here, atol=1e-2)
-    np.testing.assert_allclose(see(surface, (0.0, surface.period_m[1], 0.0), 128), here, atol=1e-2)
-
-
-def test_gravel_has_the_contrast_of_gravel() -> None:
-    def gradient_rms(image: np.ndarray) -> float:
-        return float(np.sqrt(np.mean(np.gradient(image)[1] ** 2)))
-
-    ours, real = (see(s, (0.0, 0.0, 0.0)) for s in (gravel(512, np.random.default_rng(0)), paper_surface()))
-    assert gradient_rms(real) == pytest.approx(7.5, abs=0.7)
-    assert gradient_rms(ours) == pytest.approx(gradient_rms(real), rel=0.2)
-    assert np.mean((ours < 1) | (ours > 254)) < 0.01
 
 
 # ---------------------------------------------------------------------------- trajectories

@@ -209,7 +209,7 @@ def _scatter(family: Family, seed: int, size_px: int, share: float, metres_per_p
         step_px = bond.step_px or (period_px if share > 0 and not bond.hidden else None)
         count = OFFSETS if step_px is None else size_px // step_px
         return CellAxis(
-            bond.side_px * metres_per_px,
+            min(bond.side_px, size_px // (1 if bond.hidden else 2)) * metres_per_px,
             bond.band_px * metres_per_px,
             size_px / count * metres_per_px,
             count,
@@ -464,7 +464,7 @@ FAMILIES: dict[str, Family] = {
         repetition=0.1,
         pattern=_board_joints,
         period_px=(BOARD_PX, BOARD_PX),
-        x=Bond(768, step_px=1),
+        x=Bond(step_px=1),
         y=Bond(BOARD_PX, _HIDDEN_PX, BOARD_PX, hidden=True),
         stagger=(5**0.5 - 1) / 2,
     ),

@@ -124,6 +124,12 @@ class Surface:
     metres_per_px: float = PAPER_METRES_PER_PX
     scatter: Scatter | None = None
 
+    def __post_init__(self) -> None:
+        # read-only whoever made it: of one type for the compiled renderer, which then exists once
+        coefficients = np.ascontiguousarray(self.coefficients, dtype=np.float32).view()
+        coefficients.setflags(write=False)
+        object.__setattr__(self, "coefficients", coefficients)
+
     @property
     def metres_per_texel(self) -> float:
         """Distance between neighbouring coefficients on the ground."""
@@ -281,10 +287,8 @@ def surface_from_periodic(
 
 
 def _wrapped(coefficients: NDArray[Any]) -> NDArray[np.float32]:
-    """Coefficients with the rows and columns that spare the sampling its index arithmetic; read-only."""
-    wrapped = np.pad(coefficients, (1, WRAP - 1), mode="wrap").astype(np.float32, copy=False)
-    wrapped.setflags(write=False)
-    return wrapped
+    """Coefficients with the rows and columns that spare the sampling its index arithmetic."""
+    return np.pad(coefficients, (1, WRAP - 1), mode="wrap").astype(np.float32, copy=False)
 
 
 def _checked(grey: ArrayLike) -> Floats:
