@@ -73,7 +73,7 @@ def warped(picture: Image, flag: int, pose: Floats) -> Image:
 
 def bias(see: Callable[[Floats], Image]) -> tuple[float, float]:
     """S-curve and largest error in px of views that are shifted along u."""
-    at = np.array([0.2, -0.2, 0.0])
+    at = np.array([(256 + (SIDE - 1) / 2) * W, -(SIDE - 1) / 2 * W, 0.0])  # pixels on the picture's pixels
     before = see(at)
     errors = np.array([shift_error(before, see(at - [d * W, 0, 0]), d) for d in FRACTIONS])
     return float(2 * np.mean(errors * np.sin(2 * np.pi * FRACTIONS))), float(np.abs(errors).max())
@@ -145,7 +145,7 @@ def main() -> None:
             lambda pose: nadir(still(pose), 0.0, readout_s=0.01),
         ),
         "pincushion": (partial(view, scene, pincushion, BELOW, DRIVE), None),
-        "barrel": (partial(view, scene, barrel, higher, DRIVE), None),
+        "barrel, coarse": (partial(view, scene, barrel, higher, DRIVE), None),
         "relief": (partial(view, Scene(ground, relief=Relief(0.002, 0.05)), NADIR_CAMERA, BELOW, DRIVE), None),
         "twice as high": (partial(view, scene, NADIR_CAMERA, Mount(np.array([0, 0, 2 * HEIGHT_M])), DRIVE), None),
         "forward, room": (partial(view, room, pinhole(SIDE, SIDE, 400.0), ahead, straight), None),

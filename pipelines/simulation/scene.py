@@ -207,9 +207,10 @@ def chessboard(
 ) -> Plane:
     """A chessboard of `columns` x `rows` inner corners (as OpenCV counts them) with a light margin.
 
-    The board's origin is its centre, its upper left square is light, so that `cv2.findChessboardCornersSB` numbers
-    the corners of a board with one odd and one even number as `chessboard_corners` does. Around every inner corner the print is exactly antisymmetric, and it is
-    smoothed symmetrically, so that its saddle point is the corner (`chessboard_corners`).
+    The board's origin is its centre. Its upper left square is light, so that `cv2.findChessboardCornersSB` numbers
+    the corners of a board with one odd and one even number of them as `chessboard_corners` does. Around every inner
+    corner the print is exactly antisymmetric, and it is smoothed symmetrically, so that its saddle point is the
+    corner.
 
     Raises:
         ValueError: no corner, no size, or a margin under half a square.
