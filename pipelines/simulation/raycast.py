@@ -74,6 +74,15 @@ def _axes(xu: float, xv: float, yu: float, yv: float) -> tuple[float, float]:
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")
+def _along(xu: float, xv: float, yu: float, yv: float, long: float) -> tuple[float, float]:
+    """The unit vector along the long half axis: J Jᵀ - long² is zero along it, so that it is normal to either row."""
+    xx, xy, yy = xu * xu + xv * xv - long * long, xu * yu + xv * yv, yu * yu + yv * yv - long * long
+    x, y = (-xy, xx) if xx < yy else (yy, -xy)
+    length = math.sqrt(x * x + y * y)
+    return x / length, y / length
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")
 def _direction(q: Floats, x: float, y: float) -> tuple[float, float, float]:
     return (
         q[0, 0] * x + q[0, 1] * y + q[0, 2],
@@ -106,40 +115,46 @@ def coarsest(q: Floats, rays: Floats, slopes: NDArray[np.float32], texel_m: floa
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
-def _seen_round(levels: Levels, x: float, y: float, size: float) -> Any:
-    """What a pixel sees whose footprint of `size` texels is as wide as long: one level, or two of them blended."""
-    number, scale, share = 0, 1.0, size / OWN_TEXELS
-    while share >= GONE and number < LEVELS - 1:
-        number, scale, share = number + 1, scale * 0.5, share * 0.5
-    grey = _at(levels[number], x * scale, y * scale)
-    if share > ALONE and number < LEVELS - 1:
-        next_one = _at(levels[number + 1], x * scale * 0.5, y * scale * 0.5)
-        grey += np.float32((share - ALONE) / (GONE - ALONE)) * (next_one - grey)
-    return grey
+def _averaged(
+    fine: Level, coarse: Level, blend: float, x: float, y: float, step_x: float, step_y: float, count: int
+) -> Any:
+    """The mean of a surface from -step to step about (x, y), texels of `fine`, in `count` samples.
 
-
-@nb.njit(cache=True, nogil=True, error_model="numpy")
-def _seen(levels: Levels, x: float, y: float, xu: float, xv: float, yu: float, yv: float) -> Any:
-    """What a pixel sees of a surface: samples along the footprint's long axis, each as wide as the short one.
-
-    Their weights are those of Hann's window over two pixels, which lets no moiré through.
+    Their weights are Tukey's biweight (1 - s²)²: over two pixels, it lets no moiré through. A share `blend` is taken
+    of the coarse level.
     """
-    long, short = _axes(xu, xv, yu, yv)
-    width = max(short, OWN_TEXELS, 2.0 * long / MOST_SAMPLES)
-    stretch = long / width
-    if stretch <= ALONE:
-        return _seen_round(levels, x, y, width)
-    reach = min((stretch - ALONE) / (GONE - ALONE), 1.0) * long
-    turn = 0.5 * math.atan2(2.0 * (xu * yu + xv * yv), xu * xu + xv * xv - yu * yu - yv * yv)
-    step_x, step_y = reach * math.cos(turn), reach * math.sin(turn)
-    count = math.ceil(2.0 * reach / width)
     total, weights = np.float32(0), np.float32(0)
     for k in range(count):
-        place = (2 * k + 1) / count - 1.0
-        weight = np.float32(0.5 + 0.5 * math.cos(math.pi * place))
-        total += weight * _seen_round(levels, x + place * step_x, y + place * step_y, width)
+        s = (2 * k + 1) / count - 1.0
+        at_x, at_y = x + s * step_x, y + s * step_y
+        grey = _at(fine, at_x, at_y)
+        if blend > 0.0:
+            grey += np.float32(blend) * (_at(coarse, 0.5 * at_x, 0.5 * at_y) - grey)
+        weight = np.float32((1.0 - s * s) ** 2)
+        total += weight * grey
         weights += weight
     return total / weights
+
+
+@nb.njit(cache=True, nogil=True, error_model="numpy", inline="always")  # a call would copy the headers of all levels
+def _seen(levels: Levels, x: float, y: float, xu: float, xv: float, yu: float, yv: float) -> Any:
+    """What a pixel sees of a surface: the mean along its footprint's long axis, at the level of the short one."""
+    long, short = _axes(xu, xv, yu, yv)
+    if long <= ALONE * OWN_TEXELS:
+        return _at(levels[0], x, y)
+    width = max(short, OWN_TEXELS, 2.0 * long / MOST_SAMPLES)
+    step_x, step_y, count = 0.0, 0.0, 1
+    if long > ALONE * width:
+        reach = min((long / width - ALONE) / (GONE - ALONE), 1.0) * long
+        away_x, away_y = _along(xu, xv, yu, yv, long)
+        step_x, step_y, count = reach * away_x, reach * away_y, math.ceil(2.0 * reach / width)
+    number, scale, share = 0, 1.0, width / OWN_TEXELS
+    while share >= GONE and number < LEVELS - 2:
+        number, scale, share = number + 1, scale * 0.5, share * 0.5
+    blend = min(max((share - ALONE) / (GONE - ALONE), 0.0), 1.0)
+    return _averaged(
+        levels[number], levels[number + 1], blend, x * scale, y * scale, step_x * scale, step_y * scale, count
+    )
 
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")

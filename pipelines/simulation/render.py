@@ -162,7 +162,7 @@ def _check_relief(relief: Relief, height_m: float, flattest: float) -> None:
     if not relief.steepest * flattest < STEEPEST:
         raise ValueError(
             f"a relief of slope {relief.steepest:.3g} seen by rays of up to {flattest:.3g} m per m of height: their "
-            f"product must stay below {STEEPEST:g}; take lower or longer bumps, or let the camera look down more steeply"
+            f"product must stay below {STEEPEST:g}; take lower or longer bumps, or a camera that looks more steeply"
         )
 
 

@@ -207,8 +207,10 @@ def chessboard(
 ) -> Plane:
     """A chessboard of `columns` x `rows` inner corners (as OpenCV counts them) with a light margin.
 
-    The board's origin is its centre. Around every inner corner the print is exactly antisymmetric, and it is
-    smoothed symmetrically, so that its saddle point is the corner (`chessboard_corners`).
+    The board's origin is its centre. Its upper left square is light, so that `cv2.findChessboardCornersSB` numbers
+    the corners of a board with one odd and one even number of them as `chessboard_corners` does. Around every inner
+    corner the print is exactly antisymmetric, and it is smoothed symmetrically, so that its saddle point is the
+    corner.
 
     Raises:
         ValueError: no corner, no size, or a margin under half a square.
@@ -219,7 +221,7 @@ def chessboard(
             f"{margin_squares} squares: at least 1 x 1, a positive size and a margin of 0.5 are needed"
         )
     margin = 2 * round(margin_squares * SQUARE_PX / 2)
-    dark = np.add.outer(np.arange(rows + 1), np.arange(columns + 1)) % 2 == 0
+    dark = np.add.outer(np.arange(rows + 1), np.arange(columns + 1)) % 2 == 1
     picture = np.where(np.kron(dark, np.ones((SQUARE_PX, SQUARE_PX))) > 0, dark_grey, light_grey)
     return _printed(np.pad(picture, margin, constant_values=light_grey), square_m / SQUARE_PX, world_t_board)
 
@@ -255,7 +257,7 @@ def poster(
     picture = 125 - 75 * cross
     if rng is not None:
         noise = scipy.ndimage.gaussian_filter(rng.standard_normal((side, side)), 2.0, mode="wrap")
-        away = np.minimum(np.abs(np.arange(side) - (side - 1) / 2) / (side / 4), 1.0) ** 2
+        away = np.clip(np.abs(np.linspace(-1, 1, side)) / 0.3 - 1.5, 0, 1)  # from 0.45 to 0.75 of the way out
         picture += contrast_grey * noise / noise.std() * np.maximum.outer(away, away)
     return _printed(np.clip(picture, 0, 255), size_m / side, upright(position_m, facing_rad))
 
