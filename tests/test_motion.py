@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
+from scipy.special import ellipe
 
 from pipelines.simulation import curves
 from pipelines.simulation import trajectories as ways
@@ -120,6 +121,8 @@ def test_closed_forms() -> None:
     phi = spiral.parameter(np.array([1.0, 10.0, 60.0]))
     np.testing.assert_allclose((phi * np.sqrt(1 + phi**2) + np.arcsinh(phi)) / 2, [1, 10, 60], atol=1e-12)
     assert math.isinf(curve("spiral").length_m)
+    ellipse = curves.Waves([curves.Wave(1.0, (2.0, 0.0), (0.0, 0.05))], end=2 * math.pi)
+    assert ellipse.length_m == pytest.approx(8 * ellipe(1 - 0.05**2 / 4), abs=1e-13)
 
 
 @pytest.mark.parametrize(
@@ -328,6 +331,10 @@ def test_arc_lengths_are_the_integral_of_the_speed(profile: Speed) -> None:
     assert (least, most) == pytest.approx((fine.min(), fine.max()), abs=1e-6)
     assert least <= fine.min()
     assert most >= fine.max()
+
+
+def test_the_farthest_point_may_lie_between_knots() -> None:
+    assert speed("knots", t_s=[0, 2, 4], speed_mps=[1, -1, -1]).extent() == pytest.approx((-2.0, 0.5))
 
 
 def test_trapezoids_run_from_standstill_to_standstill() -> None:
@@ -706,6 +713,8 @@ def test_drives_beyond_the_end_of_a_curve_are_refused() -> None:
         Drive(CURVES["lanes"], far)
     with pytest.raises(ValueError, match="from -600 m"):
         Drive(CURVES["open-spline"], far.backwards())
+    with pytest.raises(ValueError, match="from 0 m to 50 m"):
+        ways.follow(CURVES["polyline"], np.ones(50))
     whole = speed("trapezoid", distance_m=CURVES["lanes"].length_m, speed_mps=1.0)
     end = Drive(CURVES["lanes"], whole).at(np.array([whole.duration_s]))
     np.testing.assert_allclose(end.poses[0, :2], [1.2, 3.2], atol=1e-9)
@@ -740,6 +749,9 @@ def test_chains_join_their_parts() -> None:
         Chain([run, Swaying(run, roll_rad=0.1)])
     with pytest.raises(ValueError, match="no motions"):
         Chain([])
+    short = [Drive(curve("circle"), speed("constant", speed_mps=1.0, duration_s=t)) for t in (0.1, 0.2)]
+    moving = Chain(short)  # 0.1 + 0.2 - 0.1 > 0.2 in floating point, and yet it has not ended
+    assert np.hypot(*moving.at(np.array([moving.duration_s])).velocity_mps[0, :2]) == pytest.approx(1)
     moving = Chain([circle, circle])
     assert moving.at(np.array([2.0])).velocity_mps[0] == pytest.approx([math.cos(2 / 1.2), math.sin(2 / 1.2), 0])
 

@@ -74,12 +74,19 @@ class Curve(ABC):
         """First derivative [..., 2]."""
         return np.moveaxis(self.derivative(np.asarray(t, dtype=np.float64), 1), 0, -1)
 
-    def reaches(self, start_m: float, stop_m: float) -> bool:
-        """Whether all arc lengths from `start_m` to `stop_m` lie on the curve (to 1e-9 of its length)."""
-        if self.closed or math.isinf(self.length_m):
-            return True
+    def along(self, start_m: float, stop_m: float) -> Callable[[Floats], Frenet]:
+        """`measured`, for arc lengths that must lie on the curve (to 1e-9 of its length).
+
+        Raises:
+            ValueError: they lead beyond an end of the curve.
+        """
         slack = 1e-9 * self.length_m
-        return start_m >= -slack and stop_m <= self.length_m + slack
+        if not self.closed and math.isfinite(slack) and (start_m < -slack or stop_m > self.length_m + slack):
+            raise ValueError(
+                f"the drive leads from {start_m:.6g} m to {stop_m:.6g} m of a curve of {self.length_m:.6g} m: "
+                "drive less long or make the curve longer"
+            )
+        return self.measured(start_m, stop_m)
 
 
 # --------------------------------------------------- arc length where no formula gives it
