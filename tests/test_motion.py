@@ -138,6 +138,14 @@ def test_closed_curves_close(way: str, turns: int) -> None:
     assert -np.pi <= at.heading_rad[1] <= np.pi
 
 
+@pytest.mark.parametrize("way", ["circle", "square", "figure-eight", "hypotrochoid", "spline"])
+def test_long_ways_stay_on_the_curve(way: str) -> None:
+    closed = CURVES[way]
+    rounds = 300.0
+    at = closed.measured(0.0, rounds * closed.length_m)(np.array([1.0, 1.0 + rounds * closed.length_m]))
+    np.testing.assert_allclose(at.point_m[:, 1], at.point_m[:, 0], atol=1e-9)
+
+
 def test_the_square_has_four_sides_and_four_quarter_circles() -> None:
     way = curve("square", side_m=2.0, corner_m=0.3)
     assert way.length_m == pytest.approx(4 * 1.4 + 2 * np.pi * 0.3, abs=1e-12)
@@ -229,6 +237,11 @@ def test_curves_by_name_and_what_is_refused() -> None:
         curve("circle", radius=3)
     with pytest.raises(ValueError, match="points"):
         curve("spline")
+    for radius in ("three", math.nan):
+        with pytest.raises(ValueError, match="no number"):
+            curve("circle", radius_m=radius)
+    with pytest.raises(ValueError, match=r"count = 2\.5"):
+        curve("lanes", count=2.5)
     for name, parameters in {
         "circle": {"radius_m": 0},
         "square": {"corner_m": 1.5},
