@@ -10,6 +10,7 @@ import pytest
 from scipy.integrate import quad
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
+from scipy.special import ellipe
 
 from pipelines.simulation import curves
 from pipelines.simulation import trajectories as ways
@@ -120,6 +121,8 @@ def test_closed_forms() -> None:
     phi = spiral.parameter(np.array([1.0, 10.0, 60.0]))
     np.testing.assert_allclose((phi * np.sqrt(1 + phi**2) + np.arcsinh(phi)) / 2, [1, 10, 60], atol=1e-12)
     assert math.isinf(curve("spiral").length_m)
+    ellipse = curves.Waves([curves.Wave(1.0, (2.0, 0.0), (0.0, 0.05))], end=2 * math.pi)
+    assert ellipse.length_m == pytest.approx(8 * ellipe(1 - 0.05**2 / 4), abs=1e-13)
 
 
 @pytest.mark.parametrize(
@@ -133,6 +136,14 @@ def test_closed_curves_close(way: str, turns: int) -> None:
     np.testing.assert_allclose(at.point_m, np.tile(at.point_m[:, 1:2], 4), atol=2e-12)
     np.testing.assert_allclose(np.diff(at.heading_rad), 2 * np.pi * turns, atol=1e-11)
     assert -np.pi <= at.heading_rad[1] <= np.pi
+
+
+@pytest.mark.parametrize("way", ["circle", "square", "figure-eight", "hypotrochoid", "spline"])
+def test_long_ways_stay_on_the_curve(way: str) -> None:
+    closed = CURVES[way]
+    rounds = 300.0
+    at = closed.measured(0.0, rounds * closed.length_m)(np.array([1.0, 1.0 + rounds * closed.length_m]))
+    np.testing.assert_allclose(at.point_m[:, 1], at.point_m[:, 0], atol=1e-9)
 
 
 def test_the_square_has_four_sides_and_four_quarter_circles() -> None:
@@ -226,6 +237,11 @@ def test_curves_by_name_and_what_is_refused() -> None:
         curve("circle", radius=3)
     with pytest.raises(ValueError, match="points"):
         curve("spline")
+    for radius in ("three", math.nan):
+        with pytest.raises(ValueError, match="no number"):
+            curve("circle", radius_m=radius)
+    with pytest.raises(ValueError, match=r"count = 2\.5"):
+        curve("lanes", count=2.5)
     for name, parameters in {
         "circle": {"radius_m": 0},
         "square": {"corner_m": 1.5},
@@ -328,6 +344,10 @@ def test_arc_lengths_are_the_integral_of_the_speed(profile: Speed) -> None:
     assert (least, most) == pytest.approx((fine.min(), fine.max()), abs=1e-6)
     assert least <= fine.min()
     assert most >= fine.max()
+
+
+def test_the_farthest_point_may_lie_between_knots() -> None:
+    assert speed("knots", t_s=[0, 2, 4], speed_mps=[1, -1, -1]).extent() == pytest.approx((-2.0, 0.5))
 
 
 def test_trapezoids_run_from_standstill_to_standstill() -> None:
@@ -706,6 +726,8 @@ def test_drives_beyond_the_end_of_a_curve_are_refused() -> None:
         Drive(CURVES["lanes"], far)
     with pytest.raises(ValueError, match="from -600 m"):
         Drive(CURVES["open-spline"], far.backwards())
+    with pytest.raises(ValueError, match="from 0 m to 50 m"):
+        ways.follow(CURVES["polyline"], np.ones(50))
     whole = speed("trapezoid", distance_m=CURVES["lanes"].length_m, speed_mps=1.0)
     end = Drive(CURVES["lanes"], whole).at(np.array([whole.duration_s]))
     np.testing.assert_allclose(end.poses[0, :2], [1.2, 3.2], atol=1e-9)
@@ -740,6 +762,9 @@ def test_chains_join_their_parts() -> None:
         Chain([run, Swaying(run, roll_rad=0.1)])
     with pytest.raises(ValueError, match="no motions"):
         Chain([])
+    short = [Drive(curve("circle"), speed("constant", speed_mps=1.0, duration_s=t)) for t in (0.1, 0.2)]
+    moving = Chain(short)  # 0.1 + 0.2 - 0.1 > 0.2 in floating point, and yet it has not ended
+    assert np.hypot(*moving.at(np.array([moving.duration_s])).velocity_mps[0, :2]) == pytest.approx(1)
     moving = Chain([circle, circle])
     assert moving.at(np.array([2.0])).velocity_mps[0] == pytest.approx([math.cos(2 / 1.2), math.sin(2 / 1.2), 0])
 

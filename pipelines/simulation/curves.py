@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import inspect
 import math
+import numbers
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
 from functools import cached_property
@@ -74,12 +75,19 @@ class Curve(ABC):
         """First derivative [..., 2]."""
         return np.moveaxis(self.derivative(np.asarray(t, dtype=np.float64), 1), 0, -1)
 
-    def reaches(self, start_m: float, stop_m: float) -> bool:
-        """Whether all arc lengths from `start_m` to `stop_m` lie on the curve (to 1e-9 of its length)."""
-        if self.closed or math.isinf(self.length_m):
-            return True
+    def along(self, start_m: float, stop_m: float) -> Callable[[Floats], Frenet]:
+        """`measured`, for arc lengths that must lie on the curve (to 1e-9 of its length).
+
+        Raises:
+            ValueError: they lead beyond an end of the curve.
+        """
         slack = 1e-9 * self.length_m
-        return start_m >= -slack and stop_m <= self.length_m + slack
+        if not self.closed and math.isfinite(slack) and (start_m < -slack or stop_m > self.length_m + slack):
+            raise ValueError(
+                f"the drive leads from {start_m:.6g} m to {stop_m:.6g} m of a curve of {self.length_m:.6g} m: "
+                "drive less long or make the curve longer"
+            )
+        return self.measured(start_m, stop_m)
 
 
 # --------------------------------------------------- arc length where no formula gives it
@@ -201,7 +209,9 @@ def _refined(curve: Curve, edges: Floats) -> Floats:
         tangent = curve.derivative(edges, 1)
         (ax, bx), (ay, by) = ((way[:-1], way[1:]) for way in tangent)
         turn = np.arctan2(ax * by - ay * bx, ax * bx + ay * by)
-        coarse = (np.abs(whole - halves) > 1e-14 * np.abs(halves)) | (np.abs(turn) > 0.5)
+        # far out the nodes themselves are rounded, and no halving helps against that
+        rounding = 4 * np.finfo(np.float64).eps * np.abs(stop) / np.abs(stop - start)
+        coarse = (np.abs(whole - halves) > (1e-14 + rounding) * np.abs(halves)) | (np.abs(turn) > 0.5)
         if not coarse.any():
             return edges
         edges = np.insert(edges, np.flatnonzero(coarse) + 1, middle[coarse])
@@ -216,7 +226,7 @@ def _panels(curve: SmoothCurve, sign: int, reach_m: float) -> Floats:
     if sign < 0 and (reach_m == 0 or not endless):
         return edges[0]
     while n == 0 or (abs(length) < abs(reach_m) and n < last):
-        more = int(min(n + 32, last))
+        more = int(min(n + max(32, n // 2), last))
         block = _refined(curve, np.arange(n, more + 1, dtype=np.float64) * (sign * curve.panel))
         length += float(np.sum(_arc_lengths(curve, block[:-1], block[1:])))
         edges.append(block[1:])
@@ -650,6 +660,7 @@ def made(kind: str, table: Mapping[str, Callable[..., T]], name: str, parameters
 
     Raises:
         ValueError: no such name or parameter, or one that is needed is missing; the message lists what there is.
+            Or a value is no (finite) number where one is needed.
     """
     if name not in table:
         raise ValueError(f"no {kind} is named {name!r}; there are: {', '.join(sorted(table))}")
@@ -658,7 +669,14 @@ def made(kind: str, table: Mapping[str, Callable[..., T]], name: str, parameters
         signature.bind(**parameters)
     except TypeError as error:
         raise ValueError(f"{kind} {name!r}: {error}; its parameters are: {', '.join(signature.parameters)}") from error
+    for key, value in parameters.items():
+        wanted = _NUMBERS.get(signature.parameters[key].annotation)
+        if wanted is not None and not (isinstance(value, wanted) and np.isfinite(value)):
+            raise ValueError(f"{kind} {name!r}: {key} = {value!r} is no number of the right kind")
     return table[name](**parameters)
+
+
+_NUMBERS: Mapping[Any, type[numbers.Real]] = {"float": numbers.Real, "int": numbers.Integral}
 
 
 def _demand(holds: bool, what: str) -> None:

@@ -61,12 +61,7 @@ class Drive:
 
     def __post_init__(self) -> None:
         least, most = (self.start_m + arc for arc in self.speed.extent())
-        if not self.curve.reaches(least, most):
-            raise ValueError(
-                f"the drive leads from {least:.6g} m to {most:.6g} m of a curve of {self.curve.length_m:.6g} m: "
-                "drive less long or make the curve longer"
-            )
-        object.__setattr__(self, "_way", self.curve.measured(least, most))
+        object.__setattr__(self, "_way", self.curve.along(least, most))
 
     @property
     def duration_s(self) -> float:

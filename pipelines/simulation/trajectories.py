@@ -60,9 +60,13 @@ def drive(
 
 
 def follow(curve: Curve, lengths_m: Floats) -> Floats:
-    """Poses [n + 1, 3] on a curve after the given arc lengths [n]; negative lengths drive in reverse."""
+    """Poses [n + 1, 3] on a curve after the given arc lengths [n]; negative lengths drive in reverse.
+
+    Raises:
+        ValueError: the lengths lead beyond an end of the curve.
+    """
     arc_m = np.concatenate([[0.0], np.cumsum(lengths_m)])
-    at = curve.measured(float(arc_m.min()), float(arc_m.max()))(arc_m)
+    at = curve.along(float(arc_m.min()), float(arc_m.max()))(arc_m)
     return np.column_stack([*at.point_m, at.heading_rad])
 
 
