@@ -56,6 +56,7 @@ from readers.streams import (
     array,
 )
 from workbench.writers import Container, Written, write
+from workbench.writers.logs import RosMcap
 
 START_NS = 1_700_000_000_123_456_789
 MS = 1_000_000
@@ -726,6 +727,19 @@ def test_ctrl_c_does_not_cut_a_message(tmp_path: Path) -> None:
     assert signal.getsignal(signal.SIGINT) is before
     found = read_back(tmp_path / "m.bag")["/c/compressed"]
     assert [np.array_equal(s.grey(), pixels_of(k)) for k, s in zip((0, 3), found, strict=True)] == [True, True]  # type: ignore
+
+
+def test_ctrl_c_during_the_end_leaves_the_whole_file(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    close = RosMcap.close
+
+    def struck(self: RosMcap) -> None:
+        close(self)
+        os.kill(os.getpid(), signal.SIGINT)
+
+    monkeypatch.setattr(RosMcap, "close", struck)
+    with pytest.raises(KeyboardInterrupt):
+        write(Toy(moment(0)), tmp_path / "m.mcap")
+    assert sum(map(len, read_back(tmp_path / "m.mcap").values())) == len(moment(0))
 
 
 def test_an_interrupt_before_anything_useful_leaves_nothing(tmp_path: Path) -> None:
