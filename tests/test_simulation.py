@@ -19,7 +19,6 @@ from pipelines.simulation.surfaces import (
     Surface,
     surface_from_image,
     surface_from_periodic,
-    tiles,
 )
 from readers.streams import ImageSample, PoseSample, RangeSample, StreamError
 
