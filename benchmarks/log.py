@@ -33,7 +33,7 @@ from pipelines.correlation.odometry import CorrelationOdometry
 from pipelines.correlation.settings import CorrelationSettings
 from pipelines.correlation.step import CorrelationStep
 from pipelines.replay import grey_sample
-from pipelines.simulation.mission import SimulatedMission
+from pipelines.simulation.mission import SimulatedMission, nadir_mission
 from pipelines.simulation.surfaces import gravel
 from pipelines.simulation.trajectories import drive, figure_eight
 from readers.streams import ImageSample, ReadOptions, Sample
@@ -65,7 +65,7 @@ def measured(work: Callable[[], T]) -> tuple[T, Cost]:
 def drive_over_gravel(frames: int) -> SimulatedMission:
     """The paper's figure eight at 0.51 m/s."""
     rng = np.random.default_rng(0)
-    return SimulatedMission(gravel(1024, rng), drive(figure_eight(), frames, speed_mps=0.51, rng=rng))
+    return nadir_mission(gravel(1024, rng), drive(figure_eight(), frames, speed_mps=0.51, rng=rng))
 
 
 def jpegs(mission: SimulatedMission, quality: int) -> list[bytes]:

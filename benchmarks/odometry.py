@@ -35,7 +35,7 @@ from numpy.typing import NDArray
 
 from pipelines.correlation.odometry import CorrelationOdometry
 from pipelines.correlation.settings import CorrelationSettings
-from pipelines.simulation.mission import IMAGE, SimulatedMission
+from pipelines.simulation.mission import IMAGE, SimulatedMission, nadir_mission
 from pipelines.simulation.surfaces import Surface, gravel, surface_from_image
 from pipelines.simulation.trajectories import drive, figure_eight, image_motion
 from readers.streams import ImageSample
@@ -261,7 +261,7 @@ def main() -> None:
 
     rng = np.random.default_rng(arguments.seed)
     truth = drive(figure_eight(), arguments.frames, speed_mps=arguments.speed, rng=rng)
-    mission = SimulatedMission(ground(arguments), truth, noise_grey=arguments.noise, seed=arguments.seed)
+    mission = nadir_mission(ground(arguments), truth, noise_grey=arguments.noise, seed=arguments.seed)
     frames = [mission.frame(k) for k in range(arguments.frames)]
     samples = decoded_samples(mission, frames)
     scale = mission.metres_per_px

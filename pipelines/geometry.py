@@ -64,13 +64,44 @@ def local_enu(latitude_rad: Floats, longitude_rad: Floats, altitude_m: Floats) -
     origin_height = float(altitude_m[0]) if np.isfinite(altitude_m[0]) else 0.0
     height = np.where(np.isfinite(altitude_m), altitude_m, origin_height)
     earth = earth_centred(latitude_rad, longitude_rad, height)
-    lat, lon = float(latitude_rad[0]), float(longitude_rad[0])
-    earth_to_enu = np.array(
-        [
-            [-math.sin(lon), math.cos(lon), 0.0],
-            [-math.sin(lat) * math.cos(lon), -math.sin(lat) * math.sin(lon), math.cos(lat)],
-            [math.cos(lat) * math.cos(lon), math.cos(lat) * math.sin(lon), math.sin(lat)],
-        ]
-    )
-    enu: Floats = (earth - earth[0]) @ earth_to_enu.T
+    earth_r_enu = _earth_r_enu(float(latitude_rad[0]), float(longitude_rad[0]))
+    enu: Floats = (earth - earth[0]) @ earth_r_enu
     return enu
+
+
+def from_local_enu(
+    enu_m: Floats, latitude_rad: float, longitude_rad: float, altitude_m: float
+) -> tuple[Floats, Floats, Floats]:
+    """WGS 84 latitude (rad), longitude (rad) and altitude (m), each [n], of east, north, up [n, 3] at an origin.
+
+    The inverse of `local_enu`, whose frame is the tangent plane at the origin.
+    """
+    origin = earth_centred(*(np.array([x]) for x in (latitude_rad, longitude_rad, altitude_m)))
+    return geodetic(origin + enu_m @ _earth_r_enu(latitude_rad, longitude_rad).T)
+
+
+def geodetic(earth_m: Floats) -> tuple[Floats, Floats, Floats]:
+    """WGS 84 latitude (rad), longitude (rad) and altitude (m), each [n], of earth-centred positions [n, 3].
+
+    The inverse of `earth_centred`, within some thousand km of the ellipsoid: with p = sqrt(x² + y²) the
+    latitude solves tan φ = (z + e² N sin φ)/p, a contraction by e² a turn, and h = p cos φ + z sin φ - a²/N.
+    """
+    x, y, z = earth_m.T
+    p = np.hypot(x, y)
+    latitude = np.arctan2(z, p * (1 - WGS84_ECCENTRICITY_SQUARED))
+    for _ in range(8):
+        sin = np.sin(latitude)
+        n = WGS84_MAJOR_M / np.sqrt(1 - WGS84_ECCENTRICITY_SQUARED * sin**2)
+        latitude = np.arctan2(z + WGS84_ECCENTRICITY_SQUARED * n * sin, p)
+    sin, cos = np.sin(latitude), np.cos(latitude)
+    altitude = p * cos + z * sin - WGS84_MAJOR_M * np.sqrt(1 - WGS84_ECCENTRICITY_SQUARED * sin**2)
+    return latitude, np.arctan2(y, x), altitude
+
+
+def _earth_r_enu(latitude_rad: float, longitude_rad: float) -> Floats:
+    """Rotation [3, 3] whose columns are east, north and up in earth-centred axes."""
+    sin_lat, cos_lat, sin_lon, cos_lon = (f(x) for x in (latitude_rad, longitude_rad) for f in (math.sin, math.cos))
+    east = [-sin_lon, cos_lon, 0.0]
+    north = [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
+    up = [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
+    return np.array([east, north, up]).T

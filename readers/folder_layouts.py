@@ -39,6 +39,7 @@ UE4_FROM_ENU = array([1, 0, 0], [0, -1, 0], [0, 0, 1])
 _EUROC_MODELS = {"radial-tangential": "plumb_bob", "radtan": "plumb_bob", "equidistant": "equidistant"}
 _NAN3, _NAN34 = array(*[[math.nan] * 3] * 3), array(*[[math.nan] * 4] * 3)
 HEADER_LINES = 20
+FAULTS_FILE, FAULTS_STREAM = "faults.json", "/truth/faults"
 _TUM_COLUMNS = [1, 2, 3, 4, 5, 6, 7]
 
 
@@ -50,9 +51,24 @@ def open_layout(root: Path, options: ReadOptions) -> FolderRecording | None:
     for layout in layouts:
         draft = layout(root, options)
         if draft is not None:
+            _add_faults(draft)
             _note_unused(draft, options)
             return draft.recording()
     return None
+
+
+def _add_faults(draft: Draft) -> None:
+    """The list of a simulated mission's faults, if there is one, at the time of the first sample."""
+    file = draft.path / FAULTS_FILE
+    if not file.is_file():
+        return
+    try:
+        text = file.read_bytes().decode()
+    except (OSError, UnicodeDecodeError) as error:
+        draft.damage.append(Damage(what=f"the list of faults cannot be read ({error})", where=FAULTS_FILE))
+        return
+    first_ns = min((stream.info.first_ns for stream in draft.streams if stream.info.count), default=0)
+    draft.texts(FAULTS_STREAM, [first_ns], [text], "list of faults")
 
 
 def _note_unused(draft: Draft, options: ReadOptions) -> None:

@@ -37,6 +37,7 @@ from readers.streams import (
     StreamError,
     StreamInfo,
     StreamKind,
+    TextSample,
     TrackSample,
 )
 
@@ -311,6 +312,17 @@ class Draft:
             return ScalarSample(stream=name, t_ns=t_ns, received_ns=t_ns, value=float(rows[index]))
 
         self._add(name, StreamKind.SCALAR, kind, times, make)
+
+    def texts(self, name: str, times_ns: Sequence[int] | Times, texts: Sequence[str], kind: str) -> None:
+        """Add pieces of text, [n]."""
+        order, times = self._ordered(name, times_ns)
+        rows = [texts[i] for i in order]
+
+        def make(index: int) -> Sample:
+            t_ns = int(times[index])
+            return TextSample(stream=name, t_ns=t_ns, received_ns=t_ns, text=rows[index])
+
+        self._add(name, StreamKind.TEXT, kind, times, make)
 
     def free_name(self, name: str) -> str:
         """That name, with underscores behind it if a stream has it already."""

@@ -21,6 +21,7 @@ from readers.decoding import Decoder, MessageError, decoder_of, definition_text
 from readers.message_log import Channel, Message, MessageLog, Source, in_log_order
 from readers.messages import (
     Arrival,
+    OtherUseError,
     Reader,
     UnsupportedError,
     frame_of,
@@ -190,6 +191,8 @@ class LogRecording(Recording):
                     stamps.append((message.log_ns, stamp_ns(stamp)))
             except UnsupportedError as error:
                 topic.reason = str(error)
+                if isinstance(error, OtherUseError):
+                    topic.reader = None
                 return
             except MessageError:
                 continue

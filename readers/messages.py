@@ -36,12 +36,20 @@ from readers.streams import (
     Sample,
     ScalarSample,
     StreamKind,
+    TextSample,
+    TrackSample,
     array,
 )
+
+TRACK_CHANNEL = "id"
 
 
 class UnsupportedError(MessageError):
     """A kind of message that is refused by name, as all messages of its stream are."""
+
+
+class OtherUseError(UnsupportedError):
+    """A message of a type with several uses, and this is another one than its reader's."""
 
 
 class Stamps(TypedDict):
@@ -112,20 +120,26 @@ def plain_frame(name: Any) -> str:
 # ------------------------------------------------------------------------------ small parts
 
 
+def _number(value: Any) -> float:
+    """A number; in JSON, ``null`` is NaN (rosbridge's form), and ``"NaN"``, ``"Infinity"`` are texts (protobuf's)."""
+    return math.nan if value is None else float(value)
+
+
 def _vector(v: Any) -> FloatArray:
     return array(v.x, v.y, v.z)
 
 
 def _quaternion(q: Any, arrival: Arrival) -> FloatArray:
     """Orientation x, y, z, w; NaN for an all-zero one, scaled where it is not of unit norm. Both are noted."""
-    norm = math.hypot(q.x, q.y, q.z, q.w)
+    quat = array(q.x, q.y, q.z, q.w)
+    norm = math.hypot(*quat)
     if norm == 0.0:
         arrival.oddities.append("zero_quaternion")
         return UNKNOWN_QUAT
     if abs(norm - 1.0) > 1e-3:
         arrival.oddities.append("quaternion_norm")
-        return array(q.x / norm, q.y / norm, q.z / norm, q.w / norm)
-    return array(q.x, q.y, q.z, q.w)
+        return array(*(quat / norm))
+    return quat
 
 
 def _matrix(values: Any, rows: int, columns: int) -> FloatArray:
@@ -141,7 +155,8 @@ def _matrix(values: Any, rows: int, columns: int) -> FloatArray:
 
 def _covariance6(values: Any) -> FloatArray:
     """A 6 x 6 covariance; ROS writes an unknown one as zeros."""
-    return _matrix(values, 6, 6) if np.any(values) else UNKNOWN_COV6
+    covariance = _matrix(values, 6, 6)
+    return covariance if np.any(covariance) else UNKNOWN_COV6
 
 
 def _bytes(data: Any) -> bytes | memoryview:
@@ -327,15 +342,15 @@ def pair_stream(topic: str, parent: str, child: str) -> str:
 
 
 def fix(message: Any, arrival: Arrival) -> GnssSample:
-    """sensor_msgs/NavSatFix; degrees become radians."""
+    """sensor_msgs/NavSatFix, and foxglove.LocationFix, which has no status; degrees become radians."""
     known = message.position_covariance_type != 0
     return GnssSample(
-        **arrival.stamps(message.header.stamp),
-        latitude_rad=math.radians(message.latitude),
-        longitude_rad=math.radians(message.longitude),
-        altitude_m=float(message.altitude),
+        **arrival.stamps(header_stamp(message)),
+        latitude_rad=math.radians(_number(message.latitude)),
+        longitude_rad=math.radians(_number(message.longitude)),
+        altitude_m=_number(message.altitude),
         covariance_m2=_matrix(message.position_covariance, 3, 3) if known else UNKNOWN_COV3,
-        status=int(message.status.status),
+        status=int(message.status.status) if hasattr(message, "status") else 0,
     )
 
 
@@ -343,16 +358,38 @@ def distance(message: Any, arrival: Arrival) -> RangeSample:
     """sensor_msgs/Range."""
     return RangeSample(
         **arrival.stamps(message.header.stamp),
-        range_m=float(message.range),
-        min_range_m=float(message.min_range),
-        max_range_m=float(message.max_range),
-        field_of_view_rad=float(message.field_of_view),
+        range_m=_number(message.range),
+        min_range_m=_number(message.min_range),
+        max_range_m=_number(message.max_range),
+        field_of_view_rad=_number(message.field_of_view),
     )
 
 
 def scalar(message: Any, arrival: Arrival) -> ScalarSample:
     """std_msgs/Float64, at its log time."""
-    return ScalarSample(**arrival.stamps(), value=float(message.data))
+    return ScalarSample(**arrival.stamps(), value=_number(message.data))
+
+
+# ----------------------------------------------------------------------------- tracks and text
+
+
+def tracks(message: Any, arrival: Arrival) -> TrackSample:
+    """sensor_msgs/PointCloud of pixel tracks: x = u and y = v in px, the tracks' numbers in the channel ``id``."""
+    ids = next((channel.values for channel in message.channels if channel.name == TRACK_CHANNEL), None)
+    if ids is None:
+        raise OtherUseError(f"a PointCloud without a channel {TRACK_CHANNEL!r} holds no pixel tracks")
+    points = np.array([(point.x, point.y) for point in message.points], dtype=np.float64).reshape(-1, 2)
+    if len(ids) != len(points):
+        raise MessageError(f"the PointCloud has {len(points)} points and {len(ids)} numbers of tracks")
+    numbers = np.array(ids, dtype=np.float64).astype(np.int64)
+    for values in (numbers, points):
+        values.setflags(write=False)
+    return TrackSample(**arrival.stamps(message.header.stamp), ids=numbers, points_px=points)
+
+
+def words(message: Any, arrival: Arrival) -> TextSample:
+    """std_msgs/String, at its log time."""
+    return TextSample(**arrival.stamps(), text=str(message.data))
 
 
 # --------------------------------------------------------------------------------- the table
@@ -381,10 +418,13 @@ READERS = {
     "geometry_msgs/TransformStamped": Reader(StreamKind.POSE, transform),
     "tf2_msgs/TFMessage": Reader(StreamKind.POSE, transforms, splits=True),
     "tf/tfMessage": Reader(StreamKind.POSE, transforms, splits=True),
+    "sensor_msgs/PointCloud": Reader(StreamKind.TRACK, tracks),
     "std_msgs/Float64": Reader(StreamKind.SCALAR, scalar),
+    "std_msgs/String": Reader(StreamKind.TEXT, words),
     "foxglove/RawImage": Reader(StreamKind.IMAGE, image),
     "foxglove/CompressedImage": Reader(StreamKind.IMAGE, compressed_image),
     "foxglove/CameraCalibration": Reader(StreamKind.CAMERA, camera_info),
+    "foxglove/LocationFix": Reader(StreamKind.GNSS, fix),
     "foxglove/PoseInFrame": Reader(StreamKind.POSE, pose),
     "foxglove/FrameTransform": Reader(StreamKind.POSE, transforms, splits=True),
     "foxglove/FrameTransforms": Reader(StreamKind.POSE, transforms, splits=True),

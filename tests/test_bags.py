@@ -238,16 +238,21 @@ def test_unknown_and_refused_streams_are_listed_and_not_read(tmp_path: Path) -> 
         format="16UC1; compressedDepth png",
         data=np.zeros(20, np.uint8),
     )
-    note = make("std_msgs/msg/String", data="hello")
+    note = make("std_msgs/msg/Bool", data=True)
+    cloud = make("sensor_msgs/msg/PointCloud", header=make.header(START_NS), points=[], channels=[])
     entries = [
+        Entry("/scan", "sensor_msgs/msg/PointCloud", START_NS, cloud),
         Entry("/depth", "sensor_msgs/msg/CompressedImage", START_NS, depth),
-        Entry("/note", "std_msgs/msg/String", START_NS, note),
+        Entry("/note", "std_msgs/msg/Bool", START_NS, note),
     ]
     with open_recording(write_ros1(tmp_path / "a.bag", entries)) as recording:
         assert not recording.stream("/depth").readable
         assert "compressedDepth" in recording.stream("/depth").reason
-        assert recording.stream("/note").reason == "no reader for type std_msgs/String"
-        assert "string data" in recording.stream("/note").definition
+        scan = recording.stream("/scan")
+        assert (scan.kind, scan.readable) == (StreamKind.UNKNOWN, False)
+        assert "without a channel 'id'" in scan.reason
+        assert recording.stream("/note").reason == "no reader for type std_msgs/Bool"
+        assert "bool data" in recording.stream("/note").definition
         assert list(recording.read()) == []
         with pytest.raises(StreamError, match="compressedDepth"):
             recording.read(["/depth"])
@@ -485,12 +490,12 @@ SHARED = {
     "ros1_compression/example-bz2.bag": (8647, 3254),
     "ros1_compression/example-lz4.bag": (8647, 3254),
     "ros2_db3_metadata_v2": (4695, 3130),
-    "ros2_fixtures/sqlite3/talker": (20, 0),
+    "ros2_fixtures/sqlite3/talker": (20, 10),
     "ros2_fixtures/sqlite3/cdr_test": (7, 0),
-    "ros2_fixtures/mcap/talker": (20, 0),
+    "ros2_fixtures/mcap/talker": (20, 10),
     "ros2_fixtures/mcap/cdr_test": (7, 0),
     "odd_files/ros1/no-messages.bag": (0, 0),
-    "odd_files/ros1/example-unsorted-chunks.bag": (3, 0),
+    "odd_files/ros1/example-unsorted-chunks.bag": (3, 3),
     "odd_files/ros2/sqlite3_no_messages": (0, 0),
 }
 

@@ -19,7 +19,7 @@ from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import EstimatorError
 from pipelines.geometry import wrap_angles
 from pipelines.simulation import trajectories as way
-from pipelines.simulation.mission import SimulatedMission
+from pipelines.simulation.mission import nadir_mission
 from pipelines.simulation.surfaces import Surface, surface_from_image
 from pipelines.verdict import Verdict
 from readers.streams import ImageSample, Problem, RangeSample, StreamKind
@@ -39,7 +39,7 @@ class Drive:
     """Rendered frames of a way, and what an estimator makes of them."""
 
     def __init__(self, surface: str, poses: NDArray[np.float64], *, noise: float = 2.0, seed: int = 0) -> None:
-        mission = SimulatedMission(surface_of(surface), poses, noise_grey=noise, seed=seed)
+        mission = nadir_mission(surface_of(surface), poses, noise_grey=noise, seed=seed)
         self.poses = poses
         self.frames = [mission.frame(k) for k in range(len(poses))]
         self.path_m = float(np.hypot(*np.diff(poses[:, :2], axis=0).T).sum())

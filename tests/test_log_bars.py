@@ -20,7 +20,8 @@ from pipelines.correlation.settings import CorrelationSettings
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
 from pipelines.replay import replay
-from pipelines.simulation.mission import IMAGE, DuplicateFrames, ExposureJump, SimulatedMission
+from pipelines.simulation.faults import DuplicateFrames, ExposureJump
+from pipelines.simulation.mission import IMAGE, SimulatedMission, nadir_mission
 from pipelines.simulation.surfaces import gravel
 from pipelines.simulation.trajectories import drive, figure_eight
 from pipelines.verdict import Verdict
@@ -37,7 +38,11 @@ def mission() -> SimulatedMission:
     """A drive over gravel, 512 x 512, with a jump of the exposure and an image that is sent twice."""
     rng = np.random.default_rng(3)
     poses = drive(figure_eight(), FRAMES, speed_mps=0.5, rng=rng)
-    return SimulatedMission(gravel(512, rng), poses, faults=[ExposureJump(12, 30, 1.4), DuplicateFrames(20, 21)])
+    faults = [
+        ExposureJump(start_s=11.5 / 60, stop_s=29.5 / 60, gain=1.4),
+        DuplicateFrames(start_s=19.5 / 60, stop_s=20.5 / 60),
+    ]
+    return nadir_mission(gravel(512, rng), poses, faults=faults)
 
 
 def steps_of(mission: SimulatedMission, preset: str) -> list[Step]:

@@ -10,7 +10,7 @@ import pytest
 from made_logs import MS, ROS1, ROS2, START_NS, Maker
 
 from readers.decoding import MessageError
-from readers.messages import READERS, Arrival, UnsupportedError, reader_of, samples_of, stamp_ns
+from readers.messages import READERS, Arrival, OtherUseError, UnsupportedError, reader_of, samples_of, stamp_ns
 from readers.streams import StreamKind
 
 LOG_NS = START_NS + 7 * MS
@@ -248,3 +248,73 @@ def test_type_names_are_recognised_in_all_forms() -> None:
         assert reader is not None
         assert reader.kind is StreamKind.IMAGE
     assert reader_of("sensor_msgs/msg/LaserScan") is None
+
+
+def test_text_comes_at_its_log_time() -> None:
+    sample = read("std_msgs/String", make("std_msgs/msg/String", data="two\nlines"))
+    assert (sample.text, sample.t_ns, sample.received_ns) == ("two\nlines", LOG_NS, LOG_NS)
+
+
+def cloud(*channels: tuple[str, list[float]], points: int = 2) -> Any:
+    return make(
+        "sensor_msgs/msg/PointCloud",
+        header=make.header(START_NS),
+        points=[make("geometry_msgs/msg/Point32", x=1.5 + k, y=2.25 - k, z=1.0) for k in range(points)],
+        channels=[
+            ROS2.types["sensor_msgs/msg/ChannelFloat32"](name, np.array(values, np.float32))
+            for name, values in channels
+        ],
+    )
+
+
+def test_a_point_cloud_with_ids_is_pixel_tracks() -> None:
+    sample = read("sensor_msgs/PointCloud", cloud(("u", [9, 9]), ("id", [7, 3])))
+    assert sample.t_ns == START_NS
+    assert (sample.ids.dtype, sample.ids.tolist()) == (np.int64, [7, 3])
+    np.testing.assert_array_equal(sample.points_px, [[1.5, 2.25], [2.5, 1.25]])
+    none = read("sensor_msgs/PointCloud", cloud(("id", []), points=0))
+    assert none.points_px.shape == (0, 2)
+    with pytest.raises(MessageError, match="2 points and 3 numbers of tracks"):
+        read("sensor_msgs/PointCloud", cloud(("id", [1, 2, 3])))
+    with pytest.raises(OtherUseError, match="without a channel 'id'"):
+        read("sensor_msgs/PointCloud", cloud(("intensity", [1, 2])))
+
+
+def test_location_fix() -> None:
+    stamp = SimpleNamespace(sec=START_NS // 10**9, nsec=START_NS % 10**9)
+    place = {"latitude": 60.0, "longitude": -30.0, "altitude": 12.5}
+    known = {"position_covariance": list(range(1, 10)), "position_covariance_type": 3}
+    sample = read("foxglove.LocationFix", SimpleNamespace(timestamp=stamp, frame_id="gps", **place, **known))
+    assert (sample.t_ns, sample.altitude_m, sample.status) == (START_NS, 12.5, 0)
+    assert sample.latitude_rad == pytest.approx(math.pi / 3)
+    assert sample.longitude_rad == pytest.approx(-math.pi / 6)
+    np.testing.assert_array_equal(sample.covariance_m2, np.arange(1, 10).reshape(3, 3))
+
+
+def test_numbers_that_json_has_not() -> None:
+    message = make(
+        "sensor_msgs/msg/Range",
+        header=make.header(START_NS),
+        radiation_type=1,
+        field_of_view=None,
+        min_range="-Infinity",
+        max_range="Infinity",
+        range="NaN",
+    )
+    sample = read("sensor_msgs/Range", message)
+    assert (sample.min_range_m, sample.max_range_m) == (-math.inf, math.inf)
+    assert math.isnan(sample.range_m)
+    assert math.isnan(sample.field_of_view_rad)
+    pose = make(
+        "geometry_msgs/msg/PoseStamped",
+        header=make.header(START_NS),
+        pose=make(
+            "geometry_msgs/msg/Pose",
+            position=make.vector(None, "NaN", 3.0, "Point"),
+            orientation=make.quaternion("NaN", None, "NaN", "NaN"),
+        ),
+    )
+    sample = read("geometry_msgs/PoseStamped", pose)
+    np.testing.assert_array_equal(sample.position_m, [math.nan, math.nan, 3])
+    assert np.isnan(sample.quat_xyzw).all()
+    assert sample.oddities == ()

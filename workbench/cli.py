@@ -1,4 +1,4 @@
-"""The commands: inspect, replay, view, demo, settings. The only module that prints.
+"""The commands: inspect, replay, simulate, view, demo, settings. The only module that prints.
 
 What a command concludes goes to stdout, progress and errors to stderr. Exit status: 0 done; 2 a request that
 cannot be met (one line says why); 3 the recording could be read only in part; 130 interrupted; 1 a fault of the
@@ -17,11 +17,12 @@ import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Any, Self
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Self
 
 import typer
 
 if TYPE_CHECKING:
+    from pipelines.simulation.mission import SimulatedMission
     from readers.streams import Camera, ReadOptions, Recording, StreamInfo
     from workbench.session import Outcome, Progress, Request
 
@@ -32,7 +33,7 @@ BAR_SECONDS = 0.1
 LINE_SECONDS = 5.0
 PATIENCE_SECONDS = 2.0
 
-FIRST_START = "the first start compiles the estimator, which takes up to a minute; later ones do not"
+FIRST_START = "the first start compiles what it needs, which takes up to a minute; later ones do not"
 
 app = typer.Typer(
     name="workbench",
@@ -41,6 +42,7 @@ app = typer.Typer(
     "  workbench demo                     replay the built-in recording\n"
     "  workbench inspect mission.bag      what is in a log, and what is odd about it\n"
     "  workbench replay mission.bag       replay it; the result lies in results/mission/\n"
+    "  workbench simulate --list          missions with exact truth and known faults\n"
     "  workbench view results/mission     look at the result\n\n"
     "Every command explains itself with --help. A fault is one line on stderr; --debug adds where it arose.",
     no_args_is_help=False,
@@ -57,7 +59,12 @@ def _examples(*lines: str) -> str:
 
 
 RecordingPath = Annotated[
-    Path, typer.Argument(metavar="PATH", help="ROS 1 bag, ROS 2 bag, MCAP, image folder or video", show_default=False)
+    Path,
+    typer.Argument(
+        metavar="PATH",
+        help="ROS 1 bag, ROS 2 bag, MCAP, image folder or video; sim:NAME or a scenario's TOML file",
+        show_default=False,
+    ),
 ]
 Rate = Annotated[float | None, typer.Option("--rate", metavar="HZ", help="Frame rate of images without times.")]
 TimesFile = Annotated[Path | None, typer.Option("--times", metavar="FILE", help="File with the times of the frames.")]
@@ -292,7 +299,11 @@ def replay(
         calibrate=calibrate,
         raw_images=_one_of(raw_images, ("png", "raw"), "--raw-images"),
     )
-    outcome = _replay(request)
+    _conclude(_replay(request), as_json)
+
+
+def _conclude(outcome: Outcome, as_json: bool) -> NoReturn:
+    """Print what became of a replay and leave with its exit status."""
     if as_json:
         _print_json(outcome.summary | {"folder": str(outcome.folder), "files": _files(outcome)})
     else:
@@ -300,11 +311,11 @@ def replay(
     raise typer.Exit(_status(outcome))
 
 
-def _replay(request: Request) -> Outcome:
+def _replay(request: Request, recording: Recording | None = None) -> Outcome:
     from workbench.session import run
 
     with _Bar(request.name or request.preset or request.estimator) as bar:
-        return run(request, on_progress=bar)
+        return run(request, recording=recording, on_progress=bar)
 
 
 def _status(outcome: Outcome) -> int:
@@ -338,6 +349,119 @@ def _print_summary(outcome: Outcome) -> None:
         before = name
     print(f"{'result':<{width}}  {outcome.run_file}")
     print(f"{'look at it':<{width}}  workbench view {outcome.run_file}")
+
+
+# ------------------------------------------------------------------------------- simulate
+
+
+@app.command(
+    short_help="Make a mission with exact truth and known faults, by scenario.",
+    epilog=_examples(
+        "workbench simulate --list",
+        "workbench simulate fault-motion-blur -o blur.mcap",
+        "workbench simulate paper-a --set camera.noise_grey=5 --seed 3 -o mission.bag",
+        "workbench simulate paper-a --as paper-a -o folder/",
+        "workbench simulate line --picture floor.png --replay --preset paper-a",
+        "workbench simulate sensors --show > mine.toml",
+        "workbench simulate mine.toml -o mine.mcap",
+    ),
+)
+def simulate(
+    scenario: Annotated[
+        str | None, typer.Argument(metavar="SCENARIO", help="Name of a scenario, or a TOML file.", show_default=False)
+    ] = None,
+    overrides: Annotated[
+        list[str] | None,
+        typer.Option("--set", metavar="KEY=VALUE", help="One value of the scenario, dots inside; repeatable."),
+    ] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed of everything random [the scenario's].")] = None,
+    picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Picture that the ground is made of.")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="PATH", help="File or folder to write, or of the results.")
+    ] = None,
+    container: Annotated[
+        str | None,
+        typer.Option("--as", metavar="CONTAINER", help="mcap, mcap-json, ros1, ros2, paper-a, euroc [by suffix]."),
+    ] = None,
+    images: Annotated[
+        str | None, typer.Option(metavar="FORM", help="Images as jpeg, png or stored [jpeg; png in folders].")
+    ] = None,
+    listed: Annotated[bool, typer.Option("--list", help="List the scenarios.")] = False,
+    show: Annotated[bool, typer.Option("--show", help="Print the scenario with all its keys as TOML.")] = False,
+    replayed: Annotated[bool, typer.Option("--replay", help="Replay it without a file in between.")] = False,
+    estimator: Annotated[str, typer.Option("--estimator", "-e", help="Estimator of --replay.")] = "correlation",
+    preset: Annotated[str | None, typer.Option(help="Preset of its settings.")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make a simulated mission: write it as a recording, or replay it directly.
+
+    A scenario says what the ground, the way, the sensors and the faults are. The recording carries the list of its
+    faults in /truth/faults. Same scenario, same seed: same bytes. Ctrl-C ends the file early and keeps it readable.
+    """
+    from workbench import scenarios
+    from workbench.settings import SettingsError
+
+    if listed:
+        width = max(map(len, scenarios.names()))
+        print("\n".join(f"{name:<{width}}  {scenarios.about(name)}" for name in scenarios.names()))
+        return
+    if scenario is None:
+        raise SettingsError("name a scenario, or a TOML file; workbench simulate --list names all")
+    if not (show or replayed or out):
+        raise SettingsError("say where to: -o FILE writes it, --replay replays it, --show prints it")
+    if replayed and (container or images):
+        raise SettingsError("--replay writes no recording; leave --as and --images out")
+    loaded = scenarios.load(scenario, overrides=overrides or (), seed=seed, picture=picture)
+    if show:
+        print(scenarios.to_text(loaded.scenario), end="")
+        return
+    mission = scenarios.mission(loaded)
+    if replayed:
+        _replay_mission(mission, estimator, preset, out, as_json)
+    elif out is not None:
+        _write_mission(mission, out, container, images, as_json)
+
+
+def _replay_mission(
+    mission: SimulatedMission, estimator: str, preset: str | None, out: Path | None, as_json: bool
+) -> None:
+    from workbench.session import Request
+
+    folder = out or Path("results") / mission.path.name
+    request = Request(path=Path(f"sim:{mission.path.name}"), estimator=estimator, preset=preset, out=folder)
+    _conclude(_replay(request, mission), as_json)
+
+
+def _write_mission(
+    mission: SimulatedMission, out: Path, container: str | None, images: str | None, as_json: bool
+) -> None:
+    from workbench.session import Progress
+    from workbench.writers import write
+
+    form: Any = None if images is None else _one_of(images, ("jpeg", "png", "stored"), "--images")
+    with _Bar(out.name, "message") as bar:
+        try:
+            written = write(
+                mission,
+                out,
+                container=container,
+                image_format=form,
+                on_progress=lambda done, total: bar(Progress(done, total, 0)),
+            )
+        except KeyboardInterrupt:
+            kept = f"{out} holds what was written so far" if out.exists() else "nothing was kept"
+            print(f"interrupted: {kept}", file=sys.stderr)
+            raise
+    if as_json:
+        faults = [{"name": f.name, "start_s": f.start_s, "stop_s": f.stop_s} for f in mission.faults]
+        left_out = dict(written.left_out)
+        _print_json({"path": str(out), "messages": written.messages, "left_out": left_out, "faults": faults})
+        return
+    rows = [(topic, str(count)) for topic, count in written.messages.items()]
+    print("\n".join([f"{out}: {mission.path.name}", "", *table(("stream", "messages"), rows, right=(1,))]))
+    _print_list("left out", [f"{stream}: {why}" for stream, why in written.left_out.items()])
+    _print_list("faults", [f"{f.name} from {f.start_s:.3f} to {f.stop_s:.3f} s" for f in mission.faults])
+    print(f"\nreplay it with: workbench replay {out}")
 
 
 # ----------------------------------------------------------------------------------- view
@@ -555,13 +679,13 @@ def _print_json(values: Mapping[str, Any]) -> None:
 class _Bar:
     """Progress on stderr: a bar with the time left on a terminal, else a line every few seconds."""
 
-    def __init__(self, title: str) -> None:
-        self._title = title
+    def __init__(self, title: str, unit: str = "frame") -> None:
+        self._title, self._unit = title, unit
         self._live: Any = None
         self._task: Any = None
         self._told = time.monotonic()
         self._began = self._told
-        self._patience = threading.Timer(PATIENCE_SECONDS, self._console, ["no frame yet: " + FIRST_START])
+        self._patience = threading.Timer(PATIENCE_SECONDS, self._console, [f"no {unit} yet: " + FIRST_START])
         self._patience.daemon = True
 
     def __enter__(self) -> Self:
@@ -588,7 +712,7 @@ class _Bar:
         else:
             of = "" if progress.total is None else f" of {progress.total}"
             speed = progress.done / max(now - self._began, 1e-9)
-            self._console(f"frame {progress.done}{of}, {speed:.0f} frames/s")
+            self._console(f"{self._unit} {progress.done}{of}, {speed:.0f} {self._unit}s/s")
 
     def _console(self, text: str) -> None:
         print(f"{self._title}: {text}", file=sys.stderr, flush=True)

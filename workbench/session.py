@@ -183,13 +183,17 @@ class Interrupt:
 
 
 def open_any(path: Path, options: ReadOptions) -> Recording:
-    """Open a recording of any format that a reader knows.
+    """Open a recording of any format that a reader knows, or the mission of a scenario.
 
     Raises:
         RecordingError: no reader can use it.
+        SettingsError: it is a scenario that cannot be.
     """
     from readers import open_recording
+    from workbench.scenarios import is_scenario, open_scenario
 
+    if is_scenario(path):
+        return open_scenario(path)
     return open_recording(path, options)
 
 

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, get_args
 
 from readers.streams import WorkbenchError
 
@@ -242,7 +242,21 @@ def _merge(base: Mapping[str, Any], over: Mapping[str, Any]) -> dict[str, Any]:
     merged = dict(base)
     for key, value in over.items():
         below = merged.get(key)
-        merged[key] = _merge(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+        if isinstance(below, list | tuple) and isinstance(value, dict):
+            merged[key] = _merge_places(key, below, value)
+        else:
+            merged[key] = _merge(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
+    return merged
+
+
+def _merge_places(key: str, base: Sequence[Any], over: Mapping[str, Any]) -> list[Any]:
+    """A list with some of its entries changed; `over` names them by their places, counted from 0."""
+    merged = list(base)
+    for place, value in over.items():
+        if not (place.isdecimal() and int(place) < len(merged)):
+            raise SettingsError(f"{key}.{place}: {key} has {len(merged)} entries, and the first one is {key}.0")
+        below = merged[int(place)]
+        merged[int(place)] = _merge(below, value) if isinstance(below, dict) and isinstance(value, dict) else value
     return merged
 
 
@@ -267,7 +281,7 @@ def _hint(wrong: str, known: Sequence[str]) -> str:
     if near:
         return f"did you mean {' or '.join(near)}?"
     listed = ", ".join(known[:LISTED])
-    return f"known are: {listed}" if len(known) <= LISTED else f"known are: {listed}, … (workbench settings lists all)"
+    return f"known are: {listed}" if len(known) <= LISTED else f"known are: {listed}, … ({len(known)} in all)"
 
 
 def _origin(path: Sequence[str], layers: Sequence[Layer]) -> str:
@@ -282,8 +296,9 @@ def _origin(path: Sequence[str], layers: Sequence[Layer]) -> str:
 def _known(model: type[BaseModel], path: Sequence[str]) -> list[str]:
     """The keys that a model, or the model nested in it under `path`, has."""
     for part in path:
-        nested: Any = model.model_fields[part].annotation if part in model.model_fields else None
-        if not hasattr(nested, "model_fields"):
+        annotation: Any = model.model_fields[part].annotation if part in model.model_fields else None
+        choices = [choice for choice in (annotation, *get_args(annotation)) if hasattr(choice, "model_fields")]
+        if not choices:
             return []
-        model = nested
+        model = choices[0]
     return list(model.model_fields)

@@ -38,19 +38,31 @@ class Fault:
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class RepetitiveTexture(Fault):
-    """The image centre is over a pattern that repeats itself: `tiles` both ways, `stripes` one way."""
+    """The image centre is over a pattern that repeats itself: `tiles` both ways, `stripes` one way.
+
+    It reaches `margin_m` to both sides of the way. In a mission's truth there is one fault for every time that
+    the way leads over it, with the rectangle `area_m` (x_min, x_max, y_min, y_max) that it covers, and `in_view_s`,
+    the intervals in which any of it is in view.
+    """
 
     pattern: Literal["tiles", "stripes"] = "tiles"
     period_px: int = 8
-    margin_m: float = 0.0
+    margin_m: float = 0.3
+    area_m: tuple[float, float, float, float] | None = None
+    in_view_s: tuple[tuple[float, float], ...] = ()
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LowTexture(Fault):
-    """The image centre is over ground of a gradient of `gradient_rms` grey levels per px along an axis."""
+    """The image centre is over ground of a gradient of `gradient_rms` grey levels per px along an axis.
+
+    Place and times are those of `RepetitiveTexture`.
+    """
 
     gradient_rms: float = 0.4
-    margin_m: float = 0.0
+    margin_m: float = 0.3
+    area_m: tuple[float, float, float, float] | None = None
+    in_view_s: tuple[tuple[float, float], ...] = ()
 
 
 # ---- the motion
