@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Any
 
 import numba as nb
 import numpy as np
@@ -43,7 +44,7 @@ Rng = np.random.Generator
 
 SIZE_STEP_PX = 256  # every period divides it
 FINEST, COARSEST = 1 / 4, 1 / 64  # cycles per px between which the spectrum's slope is taken
-JOINT_PX = 8  # joints begin on the first line of a paver or board; the band between two cells lies inside
+JOINT_PX = 8  # joints begin on the first line of a paver or board, and hide the band between two cells
 BOARD_PX = 128
 PAVER_PX = (128, 256)
 TREAD_PX = 128
@@ -185,7 +186,7 @@ def _tempered(texture: Floats, pattern: Floats, contrast: float, share: float, s
     seen = power * np.exp(-((2 * np.pi * PSF_SIGMA_PX * frequency) ** 2))
     sine_y, sine_x = (np.sin(2 * np.pi * f(size)) ** 2 for f in (np.fft.fftfreq, np.fft.rfftfreq))
     present = (_sum(seen * (sine_y[:, None] + sine_x)) / 2) ** 0.5 / size**2
-    return np.asarray(scipy.fft.irfft2(mixed, s=texture.shape)) * contrast / present
+    return np.asarray(scipy.fft.irfft2(mixed * contrast / present, s=texture.shape))
 
 
 def _sum(power: Floats) -> float:
@@ -363,7 +364,7 @@ def _mud(size_px: int, rng: Rng) -> Floats:
     centres = size_px * rng.random((max((size_px // 96) ** 2, 4), 2))
     y, x = np.mgrid[:size_px, :size_px].astype(np.float64)
     y, x = (p + 12 * _noise(size_px, rng, along_x_px=20) + 2 * _noise(size_px, rng, along_x_px=4) for p in (y, x))
-    tree = scipy.spatial.cKDTree(centres, boxsize=size_px)
+    tree: Any = scipy.spatial.cKDTree(centres, boxsize=np.full(2, float(size_px)))
     places = np.stack([y % size_px, x % size_px], axis=-1) % size_px
     distance, plate = tree.query(places, k=2)
     rim = distance[..., 1] - distance[..., 0]
@@ -393,7 +394,7 @@ def _wood(size_px: int, rng: Rng) -> Floats:
     for board in range(0, size_px, BOARD_PX):
         plank = grain[board : board + BOARD_PX]
         plank[:] = np.roll(plank, rng.integers(size_px), axis=1) + 0.7 * rng.standard_normal()
-    return np.asarray(grain)
+    return np.roll(grain, JOINT_PX // 2, axis=0)
 
 
 def _board_joints(shape: tuple[int, int], rng: Rng) -> Floats:
@@ -419,16 +420,16 @@ def _tread(shape: tuple[int, int], rng: Rng) -> Floats:
             for turn, shift in ((1, 0.25), (-1, 0.75)):
                 y, x = v - (row + shift) * rows, u - (column + shift) * columns
                 p, q = (x + turn * y) / 2**0.5, (y - turn * x) / 2**0.5
-                height = np.maximum(height, np.clip(1 - (p / 50) ** 2 - np.abs(q) / 9, 0, None))
-    height = _smoothed(height, 1.0)
-    lit = np.tanh(3.5 * _lit(7 * height) + 0.3 * height)
+                np.fmax(height, 1 - (p / 50) ** 2 - np.abs(q) / 9, out=height)
+    soft = _smoothed(height, 1.0)
+    lit = np.tanh(3.5 * _lit(7 * soft) + 0.3 * soft)
     return np.asarray(lit[rows : 2 * rows, columns : 2 * columns])
 
 
 def _street(size_px: int, rng: Rng) -> Floats:
-    """The faces of pavers: fine grain, wear, every one of its own shade."""
+    """The faces of pavers: fine grain, wear, every one of its own shade from the middle of a joint on."""
     tone = rng.standard_normal((size_px // PAVER_PX[0], size_px // PAVER_PX[1]))
-    tone = np.kron(tone, np.ones(PAVER_PX))
+    tone = np.roll(np.kron(tone, np.ones(PAVER_PX)), JOINT_PX // 2, axis=(0, 1))
     grain = _noise(size_px, rng, along_x_px=0.9)
     return np.asarray(0.7 * tone + 0.03 * grain + 0.5 * _fractal(size_px, rng, 2.2))
 

@@ -71,8 +71,8 @@ def _blend(before: float, own: float, t: float, mean: float, coherence: float) -
 def _offset(cells: Cells, i: float, j: float) -> tuple[float, float]:
     """Where in the picture cell (i, j) begins, in texels."""
     bits = _hashed(cells.key, np.int64(i), np.int64(j))
-    step_x = np.int64(((bits & _LOW16) * np.uint64(cells.count_x)) >> _S16)
-    step_y = np.int64(((bits >> _S48) * np.uint64(cells.count_y)) >> _S16)
+    step_x = np.int64(((bits & _LOW16) * np.uint64(cells.choices_x)) >> _S16)
+    step_y = np.int64(((bits >> _S48) * np.uint64(cells.choices_y)) >> _S16)
     return step_x * cells.step_x, step_y * cells.step_y
 
 

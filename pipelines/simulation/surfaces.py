@@ -41,7 +41,7 @@ class CellAxis(NamedTuple):
         side_m: from one cell to the next.
         band_m: length over which a cell is blended with the one before; it begins at the cell's first line.
         step_m: cells show the picture at offsets of 0, 1, … times this length.
-        count: how many such offsets there are, up to 65536.
+        choices: how many such offsets there are, up to 65536.
         coherence: share of the picture's variance that all cells have in common where they meet. A blend
             weakens only the rest, so only the rest is strengthened to keep the contrast.
     """
@@ -49,7 +49,7 @@ class CellAxis(NamedTuple):
     side_m: float
     band_m: float
     step_m: float
-    count: int = OFFSETS
+    choices: int = OFFSETS
     coherence: float = 0.0
 
 
@@ -76,9 +76,9 @@ class Scatter:
 
     def __post_init__(self) -> None:
         for name, axis in (("x", self.x), ("y", self.y)):
-            if not (0 < axis.band_m < axis.side_m and 1 <= axis.count <= OFFSETS and 0 <= axis.coherence <= 1):
+            if not (0 < axis.band_m < axis.side_m and 1 <= axis.choices <= OFFSETS and 0 <= axis.coherence <= 1):
                 raise ValueError(
-                    f"cells along {name}: {axis}: 0 < band_m < side_m, 1 <= count <= {OFFSETS} and "
+                    f"cells along {name}: {axis}: 0 < band_m < side_m, 1 <= choices <= {OFFSETS} and "
                     "0 <= coherence <= 1 are needed"
                 )
 
@@ -97,8 +97,8 @@ class Cells(NamedTuple):
     band_y: float
     step_x: float
     step_y: float
-    count_x: int
-    count_y: int
+    choices_x: int
+    choices_y: int
     coherence_x: float
     coherence_y: float
     stagger: float
@@ -158,8 +158,8 @@ class Surface:
             s.y.band_m * scale,
             s.x.step_m * scale,
             s.y.step_m * scale,
-            s.x.count,
-            s.y.count,
+            s.x.choices,
+            s.y.choices,
             s.x.coherence,
             s.y.coherence,
             s.stagger,
