@@ -327,6 +327,11 @@ def test_an_exposure_that_cannot_be_is_refused() -> None:
             view(Scene(waves()), PLAIN, above(), still(), 0.0, **wrong)
 
 
+def test_a_camera_below_the_ground_is_refused() -> None:
+    with pytest.raises(ValueError, match="above the ground"):
+        view(Scene(waves()), PLAIN, above(-0.1), still(), 0.0)
+
+
 # ---------------------------------------------------------------------------------- relief
 
 
@@ -564,7 +569,7 @@ def test_a_chessboard_is_where_it_says(name: str, distance: float) -> None:
     radiant = view(Scene(stones(), planes=(chessboard(7, 6, 0.1, world_t_board),)), camera, mount, still(), 0.0)
     (r,), (position,) = mount.world_t_camera(still().at(np.zeros(1)))
     truth = project(camera, (chessboard_corners(7, 6, 0.1, world_t_board) - position) @ r)
-    assert np.abs(saddles(radiant, truth) - truth).max() < 3e-3
+    assert np.abs(saddles(radiant, truth) - truth).max() < 5e-3
 
     # OpenCV's own detectors see the same corners in the same order; what they are off is theirs
     seen = expose(radiant, noise_key=0)

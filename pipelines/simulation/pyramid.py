@@ -52,7 +52,8 @@ def coarser(surface: Surface) -> Surface:
     """The same ground as a camera of half the resolution would have taken it: half the texels per metre.
 
     In the frequency domain: the point-spread function widens from `PSF_SIGMA_PX` to twice that, what the
-    coarser pixels cannot hold is cut off, and coefficients of the wider spline take the place of the old ones.
+    coarser pixels cannot hold fades out (over the upper half of what they can, so that edges do not ring), and
+    coefficients of the wider spline take the place of the old ones.
     An odd number of rows or columns is repeated once, since half of it is no whole number.
     """
     period = surface.coefficients[1 : 1 - WRAP, 1 : 1 - WRAP].astype(np.float64)
@@ -72,6 +73,7 @@ def coarser(surface: Surface) -> Surface:
 
 
 def _gain(cycles: NDArray[np.int64], n: int, sigma: float) -> Floats:
-    """From spline coefficients to wider ones: Gaussian, old response (2 + cos ω)/3 by the new one at 2 ω."""
+    """From spline coefficients to wider ones: Gaussian, fading, old response (2 + cos ω)/3 by the new one at 2 ω."""
     w = 2 * np.pi * cycles / n
-    return np.asarray(np.exp(-0.5 * (sigma * w) ** 2) * (2 + np.cos(w)) / (2 + np.cos(2 * w)))
+    fading = np.cos(np.pi * np.clip(np.abs(cycles) / (cycles.max() + 1) - 0.5, 0, 0.5)) ** 2
+    return np.asarray(fading * np.exp(-0.5 * (sigma * w) ** 2) * (2 + np.cos(w)) / (2 + np.cos(2 * w)))

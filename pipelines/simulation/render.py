@@ -70,8 +70,8 @@ def view(
             it after t_s; 0 is a global shutter, a negative time reads from the last row to the first.
 
     Raises:
-        ValueError: the exposure is negative or has no sample; pixels that the distortion does not reach; a relief
-            that the camera is in, or sees too flatly.
+        ValueError: the exposure is negative or has no sample; the camera is not above the ground; pixels that the
+            distortion does not reach; a relief that the camera is in, or sees too flatly.
     """
     if exposure_s < 0 or exposure_samples < 1:
         raise ValueError(f"an exposure of {exposure_s} s in {exposure_samples} samples: 0 s and 1 sample at least")
@@ -79,6 +79,9 @@ def view(
     moments = t_s + exposure_s * ((np.arange(n) + 0.5) / n - 0.5)
     rows = _row_shares(camera.height_px) * readout_s if readout_s else np.zeros(1)
     turns, positions = mount.world_t_camera(motion.at(np.add.outer(moments, rows).ravel()))
+    lowest = float(positions[:, 2].min())
+    if scene.ground is not None and not lowest > 0:
+        raise ValueError(f"camera height {lowest:g} m at {t_s:g} s: it must be above the ground; lift the mount")
     image = np.zeros((camera.height_px, camera.width_px), dtype=np.float32)
     for turn, position in zip(np.split(turns, n), np.split(positions, n), strict=True):
         image += _instant(scene, camera, turn, position)
@@ -129,7 +132,8 @@ def _instant(scene: Scene, camera: Camera, turns: Floats, positions: Floats) -> 
 def _table(camera: Camera) -> tuple[Floats, NDArray[np.float32]]:
     """`lens.ray_table`, kept for the cameras used last."""
     size = (camera.width_px, camera.height_px)
-    return _table_of(*size, camera.matrix.tobytes(), camera.distortion_model, camera.distortion.tobytes())
+    k, distortion = (np.asarray(a, dtype=np.float64).tobytes() for a in (camera.matrix, camera.distortion))
+    return _table_of(*size, k, camera.distortion_model, distortion)
 
 
 @functools.lru_cache(maxsize=8)
