@@ -671,12 +671,12 @@ def made(kind: str, table: Mapping[str, Callable[..., T]], name: str, parameters
         raise ValueError(f"{kind} {name!r}: {error}; its parameters are: {', '.join(signature.parameters)}") from error
     for key, value in parameters.items():
         wanted = _NUMBERS.get(signature.parameters[key].annotation)
-        if wanted is not None and not (isinstance(value, wanted) and np.isfinite(value)):
+        if wanted is not None and not (isinstance(value, wanted) and math.isfinite(value)):
             raise ValueError(f"{kind} {name!r}: {key} = {value!r} is no number of the right kind")
     return table[name](**parameters)
 
 
-_NUMBERS: Mapping[Any, type[numbers.Real]] = {"float": numbers.Real, "int": numbers.Integral}
+_NUMBERS: Mapping[Any, Any] = {"float": numbers.Real, "int": numbers.Integral}
 
 
 def _demand(holds: bool, what: str) -> None:
