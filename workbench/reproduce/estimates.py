@@ -10,7 +10,6 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.correlation.equations import Motion
 from pipelines.correlation.odometry import CorrelationOdometry
@@ -185,5 +184,4 @@ class RenderedOnce(Recording):
         if not self._there[slot]:
             self._pixels[slot] = np.frombuffer(sample.data, np.uint8)
             self._there[slot] = True
-        pixels: NDArray[np.uint8] = self._pixels[slot]
-        return memoryview(np.ascontiguousarray(pixels)).cast("B")
+        return np.asarray(self._pixels[slot]).data.cast("B")

@@ -23,8 +23,10 @@ from workbench.reproduce.measures import Accuracy, accuracy
 from workbench.reproduce.tasks import Tick
 from workbench.settings import settings_values
 
-PAPER, PRIOR, PRINTED, BEST = "paper-a", "paper-a, speed prior", "paper-a, as printed", "best"
-METHODS = (PAPER, PRIOR, PRINTED, BEST)
+PAPER, PRIOR, PRINTED = "paper-a", "paper-a, speed prior", "paper-a, as printed"
+EXACT, BEST = "paper-a, whole vector", "best"
+METHODS = (PAPER, PRIOR, PRINTED, EXACT, BEST)
+"""The preset without correction; with its two readings; its measurements integrated exactly; the other preset."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -67,15 +69,20 @@ class Run:
 
     @cached_property
     def poses(self) -> dict[str, Floats]:
-        """The poses [n, 3] of every method; the corrections act on what paper-a measured."""
+        """The poses [n, 3] of every method; corrections and exact integration act on what paper-a measured."""
         measured = self.seen[PAPER]
         dt_s = np.full(len(self.truth) - 1, 1 / RATE_HZ)
         readings = est.variants(self.cell.settings(self.truth[0])[PAPER])
-        corrected = {
-            method: est.dead_reckoned(readings[reading], measured.shift_px, measured.turn_rad, dt_s)
-            for method, reading in ((PRIOR, "speed prior"), (PRINTED, "as printed"))
+        again = {
+            PRIOR: readings["speed prior"],
+            PRINTED: readings["as printed"],
+            EXACT: readings["none"].model_copy(update={"integration": "exact"}),
         }
-        return {PAPER: measured.pose, **corrected, BEST: self.seen[BEST].pose}
+        changed = {
+            method: est.dead_reckoned(settings, measured.shift_px, measured.turn_rad, dt_s)
+            for method, settings in again.items()
+        }
+        return {PAPER: measured.pose, **changed, BEST: self.seen[BEST].pose}
 
     @cached_property
     def accuracies(self) -> dict[str, Accuracy]:
@@ -132,6 +139,12 @@ def ticks(cell: Cell, log: bool) -> int:
 def log_folder(cell: Cell, folder: Path) -> Path:
     """Where the log of a drive lies."""
     return folder / f"log-{cell.name}"
+
+
+def has_log(cell: Cell, folder: Path) -> bool:
+    """Whether the log of a drive is there."""
+    files = ("sensors.rrd", f"{PAPER}.rrd", f"{BEST}.rrd")
+    return all((log_folder(cell, folder) / file).is_file() for file in files)
 
 
 def _logged(frames: est.RenderedOnce, cell: Cell, preset: str, folder: Path, tick: Tick) -> est.Estimate:
