@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from scipy.special import ndtri
 
 from pipelines.simulation.sampling import grey_at
-from pipelines.simulation.surfaces import Surface
+from pipelines.simulation.surfaces import Cells, Surface
 
 Floats = NDArray[np.float64]
 
@@ -81,11 +81,11 @@ def radiance(
 ) -> NDArray[np.float32]:
     """Noise-free grey levels [height, width] of the ground that the camera sees."""
     image = np.empty(shape, dtype=np.float32)
-    _paint(surface.coefficients, _texel_h_pixel(surface, world_h_pixel), EVERYWHERE, image)
+    _paint(surface.coefficients, surface.cells, _texel_h_pixel(surface, world_h_pixel), EVERYWHERE, image)
     for p in patches:
         scale = 1 / p.surface.metres_per_texel
         bounds = (p.x_min_m * scale, p.x_max_m * scale, -p.y_max_m * scale, -p.y_min_m * scale)
-        _paint(p.surface.coefficients, _texel_h_pixel(p.surface, world_h_pixel), bounds, image)
+        _paint(p.surface.coefficients, p.surface.cells, _texel_h_pixel(p.surface, world_h_pixel), bounds, image)
     return image
 
 
@@ -128,7 +128,11 @@ def _texel_h_pixel(surface: Surface, world_h_pixel: Floats) -> Floats:
 
 @nb.njit(cache=True, nogil=True, error_model="numpy")
 def _paint(
-    coef: NDArray[np.float32], h: Floats, bounds: tuple[float, float, float, float], image: NDArray[np.float32]
+    coef: NDArray[np.float32],
+    cells: Cells,
+    h: Floats,
+    bounds: tuple[float, float, float, float],
+    image: NDArray[np.float32],
 ) -> None:
     """Paint a surface into an image, inside `bounds` (texels x0, x1, y0, y1) with an edge two texels soft."""
     x0, x1, y0, y1 = bounds
@@ -140,7 +144,7 @@ def _paint(
             inside = min(min(x - x0, x1 - x), min(y - y0, y1 - y)) * 0.5 + 0.5
             if inside <= 0.0:
                 continue
-            grey = grey_at(coef, x, y)
+            grey = grey_at(coef, cells, x, y)
             if inside >= 1.0:
                 image[v, u] = grey
             else:
