@@ -14,6 +14,8 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.simulation.signals import smooth_step as smooth_step
+
 Floats = NDArray[np.float64]
 
 NADIR = np.diag([1.0, -1.0, -1.0])  # body_r_camera: straight down, image u forward, v to the right
@@ -47,7 +49,7 @@ class Kinematics:
     @property
     def body_velocity_mps(self) -> Floats:
         """Velocity in body axes [n, 3]."""
-        return np.asarray(np.einsum("nji,nj->ni", self.world_r_body, self.velocity_mps))
+        return rotated(self.world_r_body.swapaxes(1, 2), self.velocity_mps)
 
     @property
     def poses(self) -> Floats:
@@ -58,21 +60,18 @@ class Kinematics:
         """The motion of another point of the same body, `point_m` [3] in body axes, with the same axes."""
         rate, change = self.angular_velocity_radps, self.angular_acceleration_radps2
         offset = np.broadcast_to(point_m, rate.shape)
-        swing = np.cross(rate, offset)
-        pull = np.cross(change, offset) + np.cross(rate, swing)
+        swing = cross(rate, offset)
+        pull = cross(change, offset) + cross(rate, swing)
         return Kinematics(
             t_s=self.t_s,
-            position_m=self.position_m + self._world(offset),
+            position_m=self.position_m + rotated(self.world_r_body, offset),
             world_r_body=self.world_r_body,
-            velocity_mps=self.velocity_mps + self._world(swing),
-            acceleration_mps2=self.acceleration_mps2 + self._world(pull),
+            velocity_mps=self.velocity_mps + rotated(self.world_r_body, swing),
+            acceleration_mps2=self.acceleration_mps2 + rotated(self.world_r_body, pull),
             angular_velocity_radps=rate,
             angular_acceleration_radps2=change,
             heading_rad=self.heading_rad,
         )
-
-    def _world(self, vectors: Floats) -> Floats:
-        return np.asarray(np.einsum("nij,nj->ni", self.world_r_body, vectors))
 
 
 class Motion(Protocol):
@@ -129,6 +128,31 @@ def rotations(heading_rad: Floats, pitch_rad: Floats, roll_rad: Floats) -> Float
         [-sp, cp * sr, cp * cr],
     ]
     return np.moveaxis(np.array(rows), -1, 0)
+
+
+# Written out term by term, so that the last digit does not depend on how many times are asked for at once.
+
+
+def rotated(matrices: Floats, vectors: Floats) -> Floats:
+    """Matrices [n, 3, 3] times vectors [n, 3]."""
+    total: Floats = matrices[:, :, 0] * vectors[:, None, 0]
+    for k in (1, 2):
+        total = total + matrices[:, :, k] * vectors[:, None, k]
+    return total
+
+
+def chained(first: Floats, second: Floats) -> Floats:
+    """Products [n, 3, 3] of matrices [n, 3, 3]."""
+    total: Floats = first[:, :, 0, None] * second[:, None, 0]
+    for k in (1, 2):
+        total = total + first[:, :, k, None] * second[:, None, k]
+    return total
+
+
+def cross(a: Floats, b: Floats) -> Floats:
+    """Vector products [n, 3] of vectors [n, 3]."""
+    (ax, ay, az), (bx, by, bz) = a.T, b.T
+    return np.stack([ay * bz - az * by, az * bx - ax * bz, ax * by - ay * bx], axis=-1)
 
 
 def looking(base: Floats, *, yaw_rad: float = 0.0, pitch_rad: float = 0.0, roll_rad: float = 0.0) -> Floats:
@@ -211,14 +235,4 @@ def body_rates(
             cr * pitch_rate + cp * sr * heading_rate,
             -sr * pitch_rate + cp * cr * heading_rate,
         ]
-    )
-
-
-def smooth_step(x: Floats) -> tuple[Floats, Floats, Floats]:
-    """10x³ - 15x⁴ + 6x⁵, 0 below 0 and 1 above 1, with its first and second derivative."""
-    x = np.clip(x, 0.0, 1.0)
-    return (
-        x**3 * (10 + x * (6 * x - 15)),
-        30 * x**2 * (1 - x) ** 2,
-        60 * x * (1 - x) * (1 - 2 * x),
     )
