@@ -15,8 +15,9 @@ import scipy.signal
 from pipelines.geometry import Floats
 from pipelines.simulation import trajectories as way
 from pipelines.simulation.channels import rng_of
+from pipelines.simulation.families import FAMILIES, ground
 from pipelines.simulation.mission import PAPER_HEIGHT_M, SimulatedMission
-from pipelines.simulation.surfaces import PAPER_METRES_PER_PX, Surface, gravel, surface_from_image
+from pipelines.simulation.surfaces import PAPER_METRES_PER_PX, Surface, surface_from_image
 from readers.streams import Recording
 from workbench.settings import SettingsError
 
@@ -28,14 +29,9 @@ METRES_PER_PX = PAPER_METRES_PER_PX
 """W = 0.0782 cm/px."""
 TAU_FRAMES = 100.0
 """Correlation time of height and tilt, which gives the study's error per frame at its 0.04 degrees."""
-SURFACE_SIDE_PX = 1024
 
 
 # ------------------------------------------------------------------------------ the ground
-
-SURFACES: Mapping[str, Callable[[int], Surface]] = {
-    "gravel": lambda seed: gravel(SURFACE_SIDE_PX, rng_of(seed, "gravel")),
-}
 
 
 @cache
@@ -43,38 +39,32 @@ def surface_of(name: str, seed: int) -> Surface:
     """The surface of that name, or the one that is made of a picture.
 
     Args:
-        name: one of `SURFACES`, or the path of a picture.
+        name: one of `FAMILIES`, or the path of a picture.
         seed: of the surface, where it is one of ours.
 
     Raises:
         SettingsError: there is neither a surface nor a picture of that name.
     """
-    if name in SURFACES:
-        return SURFACES[name](seed)
+    if name in FAMILIES:
+        return ground(name, seed=seed)
     picture = cv2.imread(name, cv2.IMREAD_COLOR) if Path(name).is_file() else None
     if picture is None:
-        raise SettingsError(f"--surface {name}: neither a picture nor one of the surfaces {', '.join(SURFACES)}")
+        raise SettingsError(f"--surface {name}: neither a picture nor one of the surfaces {', '.join(FAMILIES)}")
     return surface_from_image(picture.astype(np.float64) @ [0.114, 0.587, 0.299])
 
 
 # --------------------------------------------------------------------------------- the way
 
 
-def lissajous(length_m: float = 3.0, width_m: float = 1.5) -> way.Curve:
-    """A closed curve (length sin 2t, width sin 3t) that crosses itself seven times."""
-    return way.Curve(
-        lambda t: np.stack([length_m * np.sin(2 * t), width_m * np.sin(3 * t)], axis=-1),
-        lambda t: np.stack([2 * length_m * np.cos(2 * t), 3 * width_m * np.cos(3 * t)], axis=-1),
-    )
-
-
 TRAJECTORIES: Mapping[str, Callable[[], way.Curve]] = {
-    "line": partial(way.line, 0.3),
-    "circle": way.circle,
-    "figure-eight": way.figure_eight,
-    "intersecting": lissajous,
-    "non-intersecting": way.spiral,
+    "line": partial(way.curve, "line", heading_rad=0.3),
+    "circle": partial(way.curve, "circle"),
+    "square": partial(way.curve, "square"),
+    "figure-eight": partial(way.curve, "figure-eight"),
+    "intersecting": partial(way.curve, "hypotrochoid"),
+    "non-intersecting": partial(way.curve, "wander"),
 }
+"""Those of the paper, by its names."""
 
 
 # --------------------------------------------------------------------------- disturbances

@@ -9,9 +9,10 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from pipelines.simulation.families import FAMILIES
 from readers.streams import RecordingError
 from workbench.reproduce import correction, experiment, limits, matrix, report
-from workbench.reproduce.conditions import CONDITIONS, FRAMES, SURFACES, surface_of
+from workbench.reproduce.conditions import CONDITIONS, FRAMES, surface_of
 from workbench.reproduce.tasks import carried_out
 from workbench.settings import SettingsError
 
@@ -48,7 +49,7 @@ class Plan:
     @property
     def surfaces(self) -> tuple[str, ...]:
         """The surfaces of matrix and limits."""
-        return (self.surface,) if self.surface else tuple(SURFACES)
+        return (self.surface,) if self.surface else tuple(FAMILIES)
 
     @property
     def cells(self) -> list[experiment.Cell]:
@@ -112,7 +113,7 @@ def _check(plan: Plan) -> None:
     ):
         if value is not None and value < least:
             raise SettingsError(f"--{name} {value}: must be {least} or more")
-    if plan.surface is not None and plan.surface not in SURFACES:
+    if plan.surface is not None and plan.surface not in FAMILIES:
         surface_of(plan.surface, 0)
     plan.cells[0].identity  # noqa: B018 (the settings are checked before anything is computed)
     try:

@@ -266,8 +266,7 @@ def _set_up(results: Results) -> Iterator[str]:
     yield (
         f"{results.frames} frames at {RATE_HZ:g} Hz, {Path(results.surface).name}, figure eight at {SPEED_MPS:g} m/s "
         f'(the paper\'s "2 km/h"), noise {NOISE_GREY:g} grey levels, W = {100 * METRES_PER_PX:.4f} cm/px, K = 25, '
-        f"seeds "
-        f"{', '.join(map(str, results.seeds))}."
+        f"seeds {', '.join(map(str, results.seeds))}."
     )
     yield ""
     for condition in CONDITIONS:
@@ -323,8 +322,8 @@ def _limits_lines(results: Results, folder: Path) -> Iterator[str]:
     yield from ("", "## Which fragment is needed where", "")
     yield (
         f"False peaks (more than {limits.FALSE_PX:g} px off) in % of {', '.join(map(str, samples))} fragments a cell. "
-        f"Usual: noise {limits.USUAL_NOISE:g}, search radius {limits.USUAL_RADIUS} px, rotation {limits.USUAL_ROTATION:g}°. "
-        "N needed: the smallest with at most 1 %."
+        f"Usual: noise {limits.USUAL_NOISE:g}, search radius {limits.USUAL_RADIUS} px, rotation "
+        f"{limits.USUAL_ROTATION:g}°. N needed: the smallest with at most 1 %."
     )
     for varied, table in limits_tables(results.limits).items():
         yield from ("", f"### By {varied}", "", *markdown(table))
