@@ -24,7 +24,8 @@ class Accuracy:
     """An estimated path against its truth: errors of the positions, and of the motions between frames.
 
     `relative_*`, `end_x`, `end_y` (of the coordinate's range) and `end_path` (of the path) are shares; `shift_px` and
-    `turn_rad` are rms errors per frame and `block_ratio` is that of the turns, over all frames that did not fail.
+    `turn_rad` are rms errors per frame and `block_ratio` is that of the turns, over all frames that did not fail;
+    `failed_turn_rad` is how far those that did have turned the heading in all, magnitudes added.
     """
 
     relative_x: float
@@ -41,6 +42,7 @@ class Accuracy:
     turn_rad: float
     block_ratio: float
     failures: int
+    failed_turn_rad: float
     frames: int
 
     @property
@@ -79,6 +81,7 @@ def accuracy(pose: Floats, truth: Floats, shift_error_px: Floats, turn_error_rad
         turn_rad=rms(turn_error_rad[~failed]),
         block_ratio=block_ratio(turn_error_rad[~failed]),
         failures=int(failed.sum()),
+        failed_turn_rad=float(np.nansum(np.abs(turn_error_rad[failed]))),
         frames=len(truth),
     )
 

@@ -60,7 +60,7 @@ def figure_of(width: float, height: float, rows: int = 1, columns: int = 1, **op
 
 def trajectories(run: Run) -> Figure:
     """As paper A's Fig. 5: the true trajectory (*) and the estimated one (o), every 25th frame."""
-    figure, axes = figure_of(9.0, 7.0, 2, 2, sharex=True, sharey=True)
+    figure, axes = figure_of(10.0, 5.8, 2, 2, sharex=True, sharey=True)
     every = slice(None, None, POINT_FRAMES)
     true = run.truth[every] * 100
     for axis, method in zip(axes.flat, (PAPER, PRIOR, PRINTED, BEST), strict=True):
@@ -70,14 +70,14 @@ def trajectories(run: Run) -> Figure:
         axis.plot(*true[0, :2], "s", color=BLACK, ms=9, mfc="none", label="start")
         found = run.accuracies[method]
         title = LABELS[method] if method == BEST else f"paper-a {LABELS[method]}"
-        axis.set_title(f"{title}: rms {100 * found.rms_m:.2f} cm, end {100 * found.end_path:.2f} % of the path")
+        axis.set_title(f"{title}\nrms {100 * found.rms_m:.2f} cm, end {100 * found.end_path:.3f} % of the path")
         axis.set_aspect("equal")
         axis.label_outer()
     for axis in axes[1]:
         axis.set_xlabel("X, cm")
     for axis in axes[:, 0]:
         axis.set_ylabel("Y, cm")
-    axes[0, 0].legend(loc="lower left", framealpha=0.9)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=3)
     figure.suptitle(_title(run, "as Fig. 5: trajectories, a point every 25 frames"))
     return figure
 
@@ -99,7 +99,7 @@ def errors(run: Run) -> Figure:
     fine.set_ylabel("error of best, mm")
     fine.set_xlabel("time, s")
     for axis in axes[:, 0]:
-        axis.legend(loc="upper left", framealpha=0.9)
+        axis.legend(loc="best", framealpha=0.9)
     error.set_ylim(bottom=0)
     fine.set_ylim(bottom=0)
     figure.suptitle(_title(run, "as Fig. 6: heading and error over time"))
