@@ -20,7 +20,7 @@ from workbench.reproduce.estimates import dead_reckoned, settings_of, variants
 from workbench.reproduce.measures import rms
 
 SHIFT_NOISE_PX, TURN_NOISE_RAD = 0.03, 1e-5
-SEEDS = 5
+SEEDS = 3
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 
-from workbench.reproduce import limits, pictures
+from workbench.reproduce import correction, limits, pictures
 from workbench.reproduce.conditions import (
     CONDITIONS,
     METRES_PER_PX,
@@ -23,7 +23,7 @@ from workbench.reproduce.conditions import (
     SPEED_MPS,
     TAU_FRAMES,
 )
-from workbench.reproduce.correction import READINGS, TRUTHS, Effect
+from workbench.reproduce.correction import READINGS, SHIFT_NOISE_PX, TRUTHS, TURN_NOISE_RAD, Effect
 from workbench.reproduce.experiment import METHODS, Run
 from workbench.reproduce.matrix import PRESETS
 from workbench.reproduce.measures import Accuracy
@@ -286,8 +286,9 @@ QUANTITIES = (
     "failed: motions more than 1 px off. Medians over the seeds.",
 )
 CORRECTION = (
-    "A front end with white noise of 0.03 px and 0.01 mrad, 2111 frames, (14)-(17) as the paper has them; medians "
-    "over five seeds. The reference speed is the nominal one, thresholds are 0.1 and 0.2 cm.",
+    f"A front end with white noise of {SHIFT_NOISE_PX:g} px and {1e3 * TURN_NOISE_RAD:g} mrad, (14)-(17) as the paper "
+    f"has them; medians over {correction.SEEDS} seeds. The reference speed is the nominal one; (20) with magnitudes, "
+    "its thresholds are 0.1 and 0.2 cm.",
 )
 
 
