@@ -143,7 +143,7 @@ def correction(effects: Sequence[Effect]) -> Figure:
 
 
 def _wrapped(text: str) -> str:
-    words, lines = text.split(), [""]
+    words, lines = text.replace(" %", "\u00a0%").split(" "), [""]
     for word in words:
         if len(lines[-1]) + len(word) > 16:
             lines.append("")
