@@ -79,7 +79,7 @@ def test_accuracy_of_a_known_error() -> None:
     assert found.failed_turn_rad == pytest.approx(4e-3)
     assert found.shift_px == pytest.approx(math.sqrt((0.09 + 0.16) / 2))
     assert found.turn_rad == pytest.approx(2e-3)
-    assert found.yaw_rad == pytest.approx(0.01)
+    assert (found.yaw_rad, found.heading_rad) == pytest.approx((0.01, 0.01))
 
 
 # ------------------------------------------------------------------------------ conditions
@@ -238,10 +238,10 @@ def test_the_cause_is_told_from_the_measurements() -> None:
     lost = runs_of(made_up(relative_euclid=0.2), made_up())
     lost[experiment.EXACT] = made_up(relative_euclid=0.01)
     assert "lateral" in said.cause([lost])
-    biased = made_up(block_ratio=3.0, failed_turn_rad=0.0)
+    biased = made_up(block_ratio=3.0, failures=1, failed_turn_rad=0.01, heading_rad=0.06)
     assert "3.0 times" in said.cause([runs_of(biased, made_up())])
-    false = made_up(failures=2, failed_turn_rad=0.07, yaw_rad=-0.06)
-    assert "2 false peaks turn the heading by 4.0°" in said.cause([runs_of(false, made_up())])
+    false = made_up(failures=2, failed_turn_rad=0.07, heading_rad=0.06)
+    assert "false peaks (2) turn the heading by 4.0°" in said.cause([runs_of(false, made_up())])
 
 
 # --------------------------------------------------------------------------- ledger, tasks

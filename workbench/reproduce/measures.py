@@ -23,7 +23,8 @@ BLOCK_FRAMES = 50
 class Accuracy:
     """An estimated path against its truth: errors of the positions, and of the motions between frames.
 
-    `relative_*`, `end_x`, `end_y` (of the coordinate's range) and `end_path` (of the path) are shares; `shift_px` and
+    `relative_*`, `end_x`, `end_y` (of the coordinate's range) and `end_path` (of the path) are shares; `yaw_rad` is the
+    error of the heading at the end, `heading_rad` its rms; `shift_px` and
     `turn_rad` are rms errors per frame and `block_ratio` is that of the turns, over all frames that did not fail;
     `failed_turn_rad` is how far those that did have turned the heading in all, magnitudes added.
     """
@@ -38,6 +39,7 @@ class Accuracy:
     end_m: float
     end_path: float
     yaw_rad: float
+    heading_rad: float
     shift_px: float
     turn_rad: float
     block_ratio: float
@@ -77,6 +79,7 @@ def accuracy(pose: Floats, truth: Floats, shift_error_px: Floats, turn_error_rad
         end_m=end_m,
         end_path=share(end_m, path_m),
         yaw_rad=float(wrap_angles(error[-1:, 2])[0]),
+        heading_rad=rms(wrap_angles(error[:, 2])),
         shift_px=rms(shift_error_px[~failed]),
         turn_rad=rms(turn_error_rad[~failed]),
         block_ratio=block_ratio(turn_error_rad[~failed]),

@@ -108,9 +108,9 @@ def cause(runs: Sequence[Mapping[str, Accuracy]]) -> str:
     if exact < CLEAR * as_paper:
         return f"(14), (16), (17) lose the lateral part of the motion; {told}"
     worst_run = max(runs, key=lambda run: run[PAPER].relative_euclid)[PAPER]
-    if worst_run.failed_turn_rad > abs(worst_run.yaw_rad) / 2:
+    if worst_run.failed_turn_rad > worst_run.heading_rad / 2:
         return (
-            f"in the worst drive {worst_run.failures} false peaks turn the heading by "
+            f"in the worst drive false peaks ({worst_run.failures}) turn the heading by "
             f"{math.degrees(worst_run.failed_turn_rad):.1f}°, and nothing in the paper's method rejects them; {told}"
         )
     ratio = spread(runs, PAPER, "block_ratio").median
