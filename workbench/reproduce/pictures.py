@@ -181,7 +181,8 @@ def limits(
 
     Args:
         rates: share of false peaks by surface and side.
-        needed: by what is varied, the names of its values and the smallest sides [surfaces, values], NaN for none.
+        needed: by what is varied, the names of its values and the smallest sides [surfaces, values], infinite for none,
+            NaN where that is not known.
         surfaces: the rows.
     """
     widths = (7, *(len(names) for names, _ in needed.values()))
@@ -210,14 +211,17 @@ def _heat(
     bar: bool = True,
     missing: str = "",
 ) -> None:
-    """A map of numbers in logarithmic colours, each number written into its cell."""
+    """A map of numbers in logarithmic colours, each written into its cell: NaN as nothing, infinity as `missing`."""
     from matplotlib.colors import LogNorm
 
     norm = LogNorm(low, high, clip=True)
-    image = axis.imshow(np.maximum(np.nan_to_num(values, nan=high), low), norm=norm, cmap="cividis", aspect="auto")
+    shown = np.ma.masked_invalid(np.clip(values, low, high))
+    image = axis.imshow(shown, norm=norm, cmap="cividis", aspect="auto")
     for (row, column), value in np.ndenumerate(values):
-        text = missing if np.isnan(value) else _short(value)
-        dark = not np.isnan(value) and norm(max(value, low)) < 0.55
+        if np.isnan(value):
+            continue
+        text = missing if np.isinf(value) else _short(value)
+        dark = norm(np.clip(value, low, high)) < 0.55
         axis.text(column, row, text, ha="center", va="center", fontsize=7, color="white" if dark else "black")
     axis.grid(visible=False)
     axis.set_title(title)

@@ -144,7 +144,9 @@ def limits_tables(found: Mapping[limits.Case, Mapping[int, float]]) -> dict[str,
     tables: dict[str, Table] = {}
     for varied in VARIED:
         rows = []
-        for case, rates in found.items():
+        surfaces = list(dict.fromkeys(case.surface for case in found))
+        for case in sorted(found, key=partial(_place, surfaces, varied.field)):
+            rates = found[case]
             if rates and varied.holds(case):
                 needed = limits.smallest_side(rates)
                 cells = [f"{100 * rates[side]:.1f}" for side in limits.SIDES_PX]
@@ -343,7 +345,7 @@ def _limits_maps(found: Mapping[limits.Case, Mapping[int, float]]) -> tuple[Any,
         smallest = np.full((len(surfaces), len(names)), np.nan)
         for (surface, value), by_side in cases.items():
             side = limits.smallest_side(by_side)
-            smallest[surfaces.index(surface), names.index(value)] = math.nan if side is None else side
+            smallest[surfaces.index(surface), names.index(value)] = math.inf if side is None else side
         needed[varied.name.partition(" (")[0]] = ([f"{name:g}" for name in names], smallest)
     return rates, needed, surfaces
 
@@ -361,3 +363,8 @@ def markdown(table: Table) -> list[str]:
 
 def _row(cells: Sequence[str]) -> str:
     return f"| {' | '.join(cells)} |"
+
+
+def _place(surfaces: Sequence[str], field: str, case: limits.Case) -> tuple[int, float]:
+    """Where a case stands in a table: by surface, then by what is varied."""
+    return surfaces.index(case.surface), float(getattr(case, field))
