@@ -1,4 +1,4 @@
-"""The commands: inspect, replay, simulate, view, demo, settings. The only module that prints.
+"""The commands: inspect, replay, simulate, view, demo, reproduce, settings. The only module that prints.
 
 What a command concludes goes to stdout, progress and errors to stderr. Exit status: 0 done; 2 a request that
 cannot be met (one line says why); 3 the recording could be read only in part; 130 interrupted; 1 a fault of the
@@ -24,6 +24,7 @@ import typer
 if TYPE_CHECKING:
     from pipelines.simulation.mission import SimulatedMission
     from readers.streams import Camera, ReadOptions, Recording, StreamInfo
+    from workbench.reproduce.paper_a import Reproduced
     from workbench.session import Outcome, Progress, Request
 
 REFUSED, IN_PART, INTERRUPTED, FAULT = 2, 3, 130, 1
@@ -580,6 +581,112 @@ def demo_recording() -> Path:
     return path
 
 
+# ------------------------------------------------------------------------------ reproduce
+
+reproduce = typer.Typer(help="Repeat a paper's experiment on simulated missions.", rich_markup_mode=None)
+app.add_typer(reproduce, name="reproduce", short_help="Repeat a paper's experiment on simulated missions.")
+
+
+@reproduce.command(
+    "paper-a",
+    short_help="Ground-surface odometry (paper A, experiment 3.2).",
+    epilog=_examples(
+        "workbench reproduce paper-a",
+        "workbench reproduce paper-a --seeds 5",
+        "workbench reproduce paper-a --matrix --limits",
+        "workbench reproduce paper-a --surface floor.png --frames 600 -o results/floor",
+        "workbench reproduce paper-a --set fragment_side_px=21 -o results/paper-a-21",
+    ),
+)
+def reproduce_paper_a(
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of the results.")] = Path(
+        "results/paper-a"
+    ),
+    surface: Annotated[
+        str | None, typer.Option(metavar="NAME|PICTURE", help="The ground [gravel; all for matrix and limits].")
+    ] = None,
+    frames: Annotated[int, typer.Option(metavar="N", help="Frames of a drive.")] = 2111,
+    seeds: Annotated[int, typer.Option(metavar="N", help="Drives of every condition.")] = 1,
+    matrix: Annotated[bool, typer.Option("--matrix", help="All surfaces, speeds and trajectories as well.")] = False,
+    limits: Annotated[bool, typer.Option("--limits", help="Which fragment is needed where, as well.")] = False,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="A setting over paper-a's; repeatable.")
+    ] = None,
+    jobs: Annotated[int | None, typer.Option(metavar="N", help="Processes [all cores].")] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Repeat paper A's experiment 3.2: paper-a before and after correction, and best, beside the paper's numbers.
+
+    The folder then holds report.md with tables and pictures, the same values as JSON and CSV, and logs of two
+    drives for the viewer. Ctrl-C leaves the finished parts; the same command goes on with the others.
+    """
+    from workbench.reproduce import paper_a, report
+
+    plan = paper_a.Plan(
+        out=out,
+        surface=surface,
+        frames=frames,
+        seeds=seeds,
+        with_matrix=matrix,
+        with_limits=limits,
+        jobs=jobs,
+        overrides=tuple(overrides or ()),
+        command=_as_typed(out, surface, frames, seeds, matrix, limits, overrides),
+    )
+    with _Bars() as bars:
+        done = paper_a.reproduce(plan, bars)
+    if as_json:
+        _print_json(report.values(done.results) | {"folder": str(done.folder), "interrupted": done.interrupted})
+    else:
+        _print_reproduced(done)
+    raise typer.Exit(INTERRUPTED if done.interrupted else 0)
+
+
+def _as_typed(
+    out: Path,
+    surface: str | None,
+    frames: int,
+    seeds: int,
+    matrix: bool,
+    limits: bool,
+    overrides: Sequence[str] | None,
+) -> str:
+    """The command that repeats this one."""
+    import shlex
+
+    words = ["workbench", "reproduce", "paper-a", "-o", str(out)]
+    words += ["--surface", surface] if surface else []
+    words += ["--frames", str(frames), "--seeds", str(seeds)]
+    words += ["--matrix"] * matrix + ["--limits"] * limits
+    for text in overrides or ():
+        words += ["--set", text]
+    return shlex.join(words)
+
+
+def _print_reproduced(done: Reproduced) -> None:
+    """Print the tables and statements of an experiment for people."""
+    from workbench.reproduce import report
+
+    results = done.results
+    tables = []
+    if results.runs:
+        tables.append(report.experiment_table(results))
+    if results.effects:
+        tables.append(report.correction_table(results.effects))
+    if results.matrix:
+        tables.append(report.matrix_table(results.matrix))
+    tables += report.limits_tables(results.limits).values() if results.limits else []
+    for heads, rows in tables:
+        print("\n".join(table(heads, rows, right=range(2, len(heads)))), end="\n\n")
+    for statement in results.statements:
+        print(f"{statement.upshot}: {statement.claim}\n    {statement.numbers}")
+    for text in results.unfinished:
+        print(f"not finished: {text}; the same command goes on")
+    print(f"\nreport  {done.file}")
+    for log in results.logs:
+        print(f"log     workbench view {log}")
+
+
 # ------------------------------------------------------------------------------- settings
 
 
@@ -728,6 +835,32 @@ class _Bar:
             self._live.start()
             self._task = self._live.add_task(self._title, total=progress.total)
         self._live.update(self._task, completed=progress.done)
+
+
+class _Bars:
+    """Progress of several things, one bar after the other."""
+
+    def __init__(self) -> None:
+        self._title = ""
+        self._bar: _Bar | None = None
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        if self._bar is not None:
+            self._bar.__exit__(kind, error, trace)
+
+    def __call__(self, title: str, done: int, total: int) -> None:
+        """Show how far the thing of that title is."""
+        from workbench.session import Progress
+
+        if self._bar is None or title != self._title:
+            self.__exit__(None, None, None)
+            self._title, self._bar = title, _Bar(title)
+        self._bar(Progress(done, total, 0))
 
 
 def _error(text: str) -> None:

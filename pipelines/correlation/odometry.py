@@ -20,33 +20,18 @@ from pipelines.correlation import kernels
 from pipelines.correlation.equations import STILL, Motion
 from pipelines.correlation.judging import Usual, alarms_over_time, median
 from pipelines.correlation.matching import NO_COVARIANCE, Candidate, Matcher, Template
-from pipelines.correlation.settings import Correction, CorrelationSettings
+from pipelines.correlation.settings import CorrelationSettings
 from pipelines.correlation.step import CorrelationStep
+from pipelines.correlation.trajectory import Pose, Segment, corrected, integrated
 from pipelines.estimator import EstimatorError
-from pipelines.geometry import wrap_angle
 from pipelines.verdict import Verdict, gravest
 from readers.streams import ImageError, ImageSample, PoseSample, Problem, RangeSample, Sample, ScalarSample, StreamKind
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]
-Pose = tuple[float, float, float]
-
 
 JITTER = 0.6
 """Intervals below this share of the usual one are taken for jitter of the stamps."""
-
-
-class Segment(NamedTuple):
-    """A correction segment: frames and sums so far, deviations at its end, what is applied and what is due."""
-
-    frames: int = 0
-    sum_m: float = 0.0
-    reference_m: float = 0.0
-    relative_deviation: float = math.nan
-    deviation_m: float = math.nan
-    applied_m: tuple[float, float] = (0.0, 0.0)
-    due_m: tuple[float, float] = (0.0, 0.0)
-    start: tuple[float, float] = (0.0, 0.0)
 
 
 class Advance(NamedTuple):
@@ -174,12 +159,12 @@ class CorrelationOdometry:
         candidate, alarms = self._find(state, previous, grey, dt_s)
         alarms |= candidate.alarms
         motion, relative, covariance_px = self._motion_between_frames(state, candidate, dt_s)
-        pose, increment, path_m = self._integrate(state.pose, motion, metres_per_px)
+        pose, increment, path_m = integrated(s, state.pose, motion, metres_per_px)
         # a measured motion starts from its template frame, a held one from the frame before
         base = candidate.template if candidate.acceptable else previous
         camera_heading = pose[2] + s.mounting_yaw_rad
         covariance = kernels.propagated(base.covariance, base.pose, pose, covariance_px, metres_per_px, camera_heading)
-        segment = self._correct(state, path_m, dt_s, pose)
+        segment = corrected(s, state.segment, state.pose, pose, path_m, dt_s)
         total = (
             state.correction_total[0] + segment.applied_m[0],
             state.correction_total[1] + segment.applied_m[1],
@@ -293,7 +278,7 @@ class CorrelationOdometry:
             return measured, measured, candidate.covariance
         return state.relative.inverse().then(measured), measured, candidate.covariance
 
-    # ------------------------------------------------------------- trajectory and correction
+    # ---------------------------------------------------------------------------------- scale
 
     def _metres_per_px(self, height_m: float, frame: int) -> float:
         """W: as given, or height over focal length."""
@@ -307,46 +292,6 @@ class CorrelationOdometry:
                 f"{s.height_stream!r} holds values from the start on"
             )
         return height_m / s.focal_px
-
-    def _integrate(self, pose: Pose, motion: Motion, metres_per_px: float) -> tuple[Pose, tuple[float, float], float]:
-        """The new pose, the increment (m) and the length of the step (m): (14), (16), (17), or exactly on SE(2)."""
-        s = self._settings
-        x, y, heading = pose
-        turned = heading + motion.rotation_rad
-        path_m = eq.path_step((motion.u, motion.v), metres_per_px)
-        if s.integration == "exact" or s.mount == "gimballed":
-            increment = eq.increment_of_vector((motion.u, motion.v), metres_per_px, turned + s.mounting_yaw_rad)
-        elif s.integration == "mid-heading":
-            increment = eq.increment_along(path_m, heading + motion.rotation_rad / 2.0)
-        else:
-            increment = eq.increment_along(path_m, turned)
-        return (x + increment[0], y + increment[1], wrap_angle(turned)), increment, path_m
-
-    def _correct(self, state: CorrelationState, path_m: float, dt_s: float, pose: Pose) -> Segment:
-        """(18)-(21): sums over the segment; at its end the correction that the next frame applies."""
-        s, old = self._settings, state.segment
-        if s.correction is Correction.OFF:
-            return old
-        assert s.correction_speed_mps is not None
-        fresh = old.frames in (0, s.correction_frames)
-        frames = 1 if fresh else old.frames + 1
-        sum_m = path_m if fresh else old.sum_m + path_m
-        nominal_m = s.correction_speed_mps * dt_s
-        reference_m = nominal_m if fresh else old.reference_m + nominal_m
-        start = state.pose[:2] if fresh else old.start
-        if frames < s.correction_frames:
-            return Segment(frames, sum_m, reference_m, applied_m=old.due_m, start=start)
-        relative, deviation = eq.deviation_of_segment(sum_m, reference_m)
-        length = 0.0
-        if eq.correction_fires(relative, deviation, s.correction_max_relative, s.correction_min_m):
-            if s.correction is Correction.SPEED_PRIOR:
-                length = eq.correction_speed_prior(deviation, s.correction_gain)
-            else:
-                length = eq.correction_as_printed(relative, deviation, s.correction_par_m)
-        # along Ox, the heading; a gimballed camera has none, so A0 corrects both coordinates: along the segment
-        heading = pose[2] if s.mount == "rigid" else math.atan2(pose[1] - start[1], pose[0] - start[0])
-        due = eq.increment_along(length, heading)
-        return Segment(frames, sum_m, reference_m, relative, deviation, old.due_m, due, start)
 
     # ---------------------------------------------------------------- frames without a motion
 
