@@ -23,7 +23,7 @@ import numpy as np
 import scipy.ndimage
 from numpy.typing import NDArray
 
-from pipelines.simulation.lens import pinhole
+from pipelines.lens import pinhole
 from pipelines.simulation.motion import FORWARD, Mount, Waypoints
 from pipelines.simulation.render import expose, noise_key_of, radiance, view, world_h_pixel
 from pipelines.simulation.scene import Plane, Relief, Scene, chessboard, poster, upright

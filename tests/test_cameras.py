@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.ndimage
 
-from pipelines.simulation.lens import pinhole, project, rays
+from pipelines.lens import pinhole, project, rays
 from pipelines.simulation.mission import nadir_camera
 from pipelines.simulation.motion import FORWARD, NADIR, Hold, Mount, Waypoints, looking, rotations
 from pipelines.simulation.pyramid import coarser, levels_of
@@ -85,7 +85,7 @@ def test_a_pixel_that_the_model_does_not_reach_is_refused() -> None:
 def test_a_pinhole_is_the_nadir_camera() -> None:
     ours, paper = pinhole(512, 512, 256.0), nadir_camera()
     for field in Camera.__dataclass_fields__:
-        assert np.array_equal(getattr(ours, field), getattr(paper, field)), field
+        np.testing.assert_array_equal(getattr(ours, field), getattr(paper, field), err_msg=field)
 
 
 @pytest.mark.parametrize(
@@ -465,7 +465,7 @@ def test_coarser_surfaces_show_the_same_ground() -> None:
 @pytest.mark.parametrize("shape", [(6, 10), (2, 2), (64, 48)])
 def test_surfaces_of_any_size_get_coarser_to_their_mean(shape: tuple[int, int]) -> None:
     picture = np.random.default_rng(0).uniform(50, 200, shape)
-    for (coefficients,) in levels_of(surface_from_periodic(picture)):
+    for coefficients, _ in levels_of(surface_from_periodic(picture)):
         assert coefficients[1:-2, 1:-2].mean() == pytest.approx(picture.mean(), abs=1e-3)
         assert np.array_equal(coefficients[0], coefficients[-3])
         assert np.array_equal(coefficients[:, 1:3], coefficients[:, -2:]) or coefficients.shape[1] == 4

@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.simulation import faults
 from pipelines.simulation import trajectories as ways
-from pipelines.simulation.mission import POSE, SimulatedMission, nadir_camera
+from pipelines.simulation.mission import POSE, nadir_camera, nadir_mission
 from pipelines.simulation.surfaces import tiles
 from readers import ReadOptions, open_recording
 from readers.streams import (
@@ -261,7 +261,7 @@ def everything() -> list[Sample]:
 @pytest.fixture(scope="module")
 def mission() -> SimulatedMission:
     poses = ways.follow(ways.circle(), np.full(7, 0.008))
-    return SimulatedMission(
+    return nadir_mission(
         tiles(64, np.random.default_rng(0)),
         poses,
         camera=nadir_camera(80, 60, 100),

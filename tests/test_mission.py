@@ -5,13 +5,13 @@ import dataclasses
 import numpy as np
 import pytest
 
+from pipelines.lens import pinhole
 from pipelines.simulation import faults as flaws
 from pipelines.simulation import trajectories as ways
 from pipelines.simulation.curves import curve
 from pipelines.simulation.driving import Drive
 from pipelines.simulation.faults import Fault
 from pipelines.simulation.imaging import CameraOnBoard
-from pipelines.simulation.lens import pinhole
 from pipelines.simulation.mission import IMAGE, INFO, SimulatedMission, nadir_mission
 from pipelines.simulation.motion import NADIR, Hold, Mount, looking
 from pipelines.simulation.patches import centres, corners, faded, inside, intervals, overlaps

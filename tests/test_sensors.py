@@ -14,10 +14,10 @@ from pydantic import BaseModel, ConfigDict, ValidationError
 from scipy.spatial.transform import Rotation
 
 from pipelines.geometry import earth_centred, from_local_enu, geodetic, heading_of_quat, local_enu
+from pipelines.lens import pinhole
 from pipelines.simulation import faults as wrong
 from pipelines.simulation import sensors as on_board
 from pipelines.simulation.channels import Channel
-from pipelines.simulation.lens import pinhole
 from pipelines.simulation.motion import FORWARD, Kinematics, Mount, Waypoints, looking, rotations
 from pipelines.simulation.noise import in_ticks, random_walk, white
 from pipelines.simulation.sensors import Gnss, Height, Imu, Odometer, Reference, Tracks

@@ -18,10 +18,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from pipelines.lens import pinhole
 from pipelines.simulation.channels import Channel, Longs
 from pipelines.simulation.faults import Fault
 from pipelines.simulation.imaging import OF_IMAGES, CameraOnBoard
-from pipelines.simulation.lens import pinhole
 from pipelines.simulation.motion import Motion, Mount, Waypoints
 from pipelines.simulation.patches import OF_GROUND, faults_met, patches_of
 from pipelines.simulation.scene import Scene

@@ -13,9 +13,9 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.lens import rays
 from pipelines.simulation.channels import rng_of
 from pipelines.simulation.faults import Fault, LowTexture, RepetitiveTexture
-from pipelines.simulation.lens import rays
 from pipelines.simulation.motion import Motion, Mount
 from pipelines.simulation.scene import Patch
 from pipelines.simulation.surfaces import Surface, surface_from_periodic, tiles

@@ -24,7 +24,7 @@ import scipy.ndimage
 from numpy.typing import NDArray
 from scipy.special import ndtri
 
-from pipelines.simulation.lens import pinhole, project, ray_table, undistorted
+from pipelines.lens import pinhole, project, ray_table, undistorted
 from pipelines.simulation.motion import Motion, Mount
 from pipelines.simulation.pyramid import level, sharp_only
 from pipelines.simulation.raycast import ALONE, OWN_TEXELS, Bumps, Window, coarsest, draw

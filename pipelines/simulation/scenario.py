@@ -20,6 +20,7 @@ import scipy.ndimage
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
+from pipelines.lens import pinhole
 from pipelines.simulation import faults as flaws
 from pipelines.simulation.channels import Channel, rng_of
 from pipelines.simulation.curves import curve
@@ -27,7 +28,6 @@ from pipelines.simulation.driving import Disturbed, Drive
 from pipelines.simulation.families import ground as ground_of_family
 from pipelines.simulation.faults import Fault
 from pipelines.simulation.imaging import OF_IMAGES, CameraOnBoard
-from pipelines.simulation.lens import pinhole
 from pipelines.simulation.mission import IMAGE, INFO, START_NS, SimulatedMission, digest
 from pipelines.simulation.motion import FORWARD, NADIR, Kinematics, Motion, Mount, looking
 from pipelines.simulation.patches import OF_GROUND, faults_met, patches_of

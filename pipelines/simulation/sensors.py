@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipelines.geometry import from_local_enu
+from pipelines.lens import project, rays
 from pipelines.simulation.channels import Channel, rng_of
 from pipelines.simulation.checks import check, check_word
 from pipelines.simulation.faults import (
@@ -36,7 +37,6 @@ from pipelines.simulation.faults import (
     of_kind,
     to_text,
 )
-from pipelines.simulation.lens import project, rays
 from pipelines.simulation.motion import Kinematics, Motion, Mount, rotations
 from pipelines.simulation.noise import in_ticks, measured
 from pipelines.simulation.timing import Schedule, Timing, during, frozen, schedule

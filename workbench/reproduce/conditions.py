@@ -16,7 +16,7 @@ from pipelines.geometry import Floats
 from pipelines.simulation import trajectories as way
 from pipelines.simulation.channels import rng_of
 from pipelines.simulation.families import FAMILIES, ground
-from pipelines.simulation.mission import PAPER_HEIGHT_M, SimulatedMission
+from pipelines.simulation.mission import PAPER_HEIGHT_M, nadir_mission
 from pipelines.simulation.surfaces import PAPER_METRES_PER_PX, Surface, surface_from_image
 from readers.streams import Recording
 from workbench.settings import SettingsError
@@ -130,7 +130,7 @@ def mission(
     name: str = "simulated",
 ) -> Recording:
     """The simulated recording of a downward camera on a way of poses [n, 3]."""
-    return SimulatedMission(
+    return nadir_mission(
         surface,
         poses,
         height_m=height_m,
