@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipelines.ranging import equations as eq
 from pipelines.ranging.equations import Point
 from pipelines.ranging.filter import Inputs
-from pipelines.ranging.kernels import PREDICTED, REJECTED, RESET, UPDATED, linearised
+from pipelines.ranging.kernels import LOST, PREDICTED, REJECTED, RESET, UPDATED, linearised
 from pipelines.ranging.settings import Model
 from pipelines.ranging.start import Start
 
@@ -101,6 +101,9 @@ class JointUpdate(NamedTuple):
 def step(model: Model, joint: Joint, inputs: Inputs, pixel: Floats, variance: Floats) -> tuple[Joint, JointUpdate]:
     """Carry all landmarks over an interval and update them with the image points at its end.
 
+    A landmark that comes behind the camera is LOST: its rows are NaN from then on, the others go on; `Joint.only`
+    takes it out.
+
     Args:
         model: settings and camera; relinearisation is not for the joint filter.
         joint: at the start of the interval.
@@ -109,7 +112,7 @@ def step(model: Model, joint: Joint, inputs: Inputs, pixel: Floats, variance: Fl
         variance: of an image point's coordinate [N] float64, px².
 
     Raises:
-        ValueError: the interval is negative, or a landmark passed behind the camera: take it out before.
+        ValueError: the interval is negative.
     """
     n = len(joint)
     if not inputs.dt >= 0.0:
@@ -122,8 +125,7 @@ def step(model: Model, joint: Joint, inputs: Inputs, pixel: Floats, variance: Fl
     q = np.zeros(2)
     if inputs.dt > 0.0:
         q[:] = model.q_omega / inputs.dt, 0.0 if inputs.still else model.q_speed / inputs.dt
-    if not linearise_all(model, mean, inputs.omega, speed, inputs.dt, a, g):
-        raise ValueError("a landmark passed behind the camera: take it out of the joint filter before")
+    linearise_all(model, mean, inputs.omega, speed, inputs.dt, a, g)
     blocks_ahead(covariance, a, g, q)
     _append_inputs(covariance, g, q)
     prior, prior_covariance = mean.copy(), covariance[: 3 * n, : 3 * n].copy()
@@ -138,13 +140,17 @@ def step(model: Model, joint: Joint, inputs: Inputs, pixel: Floats, variance: Fl
 
 @_jit
 def linearise_all(model: Model, mean: Floats, omega: float, speed: float, dt: float, a: Floats, g: Floats) -> bool:
-    """Predict `mean` [N, 3] in place, and fill A [N, 3, 3] and G [N, 3, 2]; False if one comes behind the camera."""
-    h = eq.held(omega, speed, dt)
+    """Predict `mean` [N, 3] in place, and fill A [N, 3, 3] and G [N, 3, 2].
+
+    Returns False if a landmark comes behind the camera; what belongs to it is NaN.
+    """
+    h, ahead = eq.held(omega, speed, dt), True
     for i in range(len(mean)):
         p = Point(mean[i, 0] - model.centre_x_px, mean[i, 1] - model.centre_y_px, mean[i, 2])
         out = linearised(model, p, h)
         if not (p.xi * out.point.xi > 0.0 and np.isfinite(out.point.xi)):
-            return False
+            mean[i], a[i], g[i], ahead = np.nan, np.nan, np.nan, False
+            continue
         mean[i, 0], mean[i, 1] = out.point.u + model.centre_x_px, out.point.v + model.centre_y_px
         mean[i, 2] = out.point.xi
         t, w = out.a, out.g
@@ -152,7 +158,7 @@ def linearise_all(model: Model, mean: Floats, omega: float, speed: float, dt: fl
         a[i, 1, 0], a[i, 1, 1], a[i, 1, 2] = t.yx, t.yy, t.yk
         a[i, 2, 0], a[i, 2, 1], a[i, 2, 2] = t.kx, 0.0, t.kk
         g[i, 0, 0], g[i, 0, 1], g[i, 1, 0], g[i, 1, 1], g[i, 2, 0], g[i, 2, 1] = w.xw, w.xv, w.yw, w.yv, w.kw, w.kv
-    return True
+    return ahead
 
 
 @_jit
@@ -238,7 +244,7 @@ def _update_all(
         at = 3 * i
         du, dv = pixel[i, 0] - mean[i, 0], pixel[i, 1] - mean[i, 1]
         if not (np.isfinite(du) and np.isfinite(dv)):
-            outcome[i] = PREDICTED
+            outcome[i] = PREDICTED if np.isfinite(mean[i, 2]) else LOST
             continue
         p = eq.Covariance(
             covariance[at, at], covariance[at, at + 1], 0.0, covariance[at + 1, at + 1], 0.0, covariance[at + 2, at + 2]
@@ -270,6 +276,7 @@ def _update_all(
             covariance[:, at : at + 3] = 0.0
             covariance[at, at] = covariance[at + 1, at + 1] = variance[i]
             covariance[at + 2, at + 2] = kept
-        mean[i, 2] = min(max(mean[i, 2], model.xi_floor), model.xi_ceiling)
+        if outcome[i] != LOST:
+            mean[i, 2] = min(max(mean[i, 2], model.xi_floor), model.xi_ceiling)
     input_error[0], input_error[1] = joint[3 * n], joint[3 * n + 1]
     return total, degrees

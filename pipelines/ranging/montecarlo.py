@@ -8,7 +8,7 @@ independent noise, in Euler steps. Only that reproduces the paper's Table 2.
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from typing import Literal
 
@@ -19,6 +19,7 @@ from scipy.stats import chi2
 from pipelines.ranging import equations as eq
 from pipelines.ranging import joint, kernels, smoother
 from pipelines.ranging.filter import UPPER, Inputs, full_covariance
+from pipelines.ranging.inputs import Synchronisation, intervals
 from pipelines.ranging.settings import FilterSettings
 from pipelines.ranging.start import Start
 from pipelines.simulation.channels import rng_of
@@ -57,8 +58,8 @@ class Scenario:
         speed_scale: odometer's scale, 1 where it is right.
         gyro_bias: of ω̃, rad/s.
         centre_error_px: what the filter takes for the principal point minus the true one.
-        blunder_share: share of image points that are off by ± blunder_px in both axes.
-        blunder_px: size of a blunder.
+        blunder_share: share of image points that are off by up to ± blunder_px in both axes, uniformly.
+        blunder_px: largest blunder.
         slip_s: time at which the track slips to another point, s; inf for never.
         slip_px: how far that point lies from the first one in the image, along x.
         slip_range_m: its depth.
@@ -258,7 +259,7 @@ def simulate(scenario: Scenario, landmark: int = 0) -> Simulated:
     if s.blunder_share > 0.0:
         hit = rng.random((n, m + 1, 1)) < s.blunder_share
         hit[:, 0] = False
-        pixel = pixel + hit * s.blunder_px * rng.choice([-1.0, 1.0], (n, m + 1, 2))
+        pixel = pixel + hit * rng.uniform(-s.blunder_px, s.blunder_px, (n, m + 1, 2))
     return Simulated(
         truth,
         omega + s.gyro_bias + s.sigma_omega * white[..., 0],
@@ -496,3 +497,108 @@ def run_smoother(scenario: Scenario, settings: FilterSettings | None = None) -> 
     covariance = np.stack([f.covariance[:, 0] for f in found])
     none = np.full(mean.shape[:2], np.nan)
     return Runs(scenario, settings, data.truth, mean, covariance, none, none)
+
+
+# -------------------------------------------------------------------------- asynchronous sensors
+
+
+@dataclass(frozen=True, kw_only=True)
+class Asynchronous:
+    """A run with sensors of different rates: a ramp up to `speed`, then steady, weaving with ω = a sin(2π t / T).
+
+    Attributes:
+        base: landmark, start, noise, runs and seed; its dt, steps, speed and omega are not used.
+        gyro_hz: rate of ω̃.
+        odometer_hz: rate of Ṽ.
+        camera_hz: rate of the images.
+        duration_s: of the run.
+        speed: V after the ramp, m/s.
+        ramp_s: length of the ramp.
+        weave: a, rad/s.
+        weave_s: T.
+    """
+
+    base: Scenario = Scenario(pixel_sigma=0.1)
+    gyro_hz: float = 50.0
+    odometer_hz: float = 20.0
+    camera_hz: float = 5.0
+    duration_s: float = 12.0
+    speed: float = 0.3
+    ramp_s: float = 3.0
+    weave: float = 0.1
+    weave_s: float = 4.0
+
+    def speed_at(self, time_s: Floats) -> Floats:
+        """True V, m/s."""
+        return np.asarray(self.speed * np.clip(time_s / self.ramp_s, 0.0, 1.0))
+
+    def omega_at(self, time_s: Floats) -> Floats:
+        """True ω, rad/s."""
+        return np.asarray(self.weave * np.sin(2.0 * math.pi * time_s / self.weave_s))
+
+    def frame_s(self) -> Floats:
+        """Times of the images [k]."""
+        return np.arange(round(self.duration_s * self.camera_hz) + 1) / self.camera_hz
+
+
+FINE_S = 1e-3
+"""Interval of the truth's integration; the speeds at its middle are held."""
+
+
+def run_asynchronous(
+    scenario: Asynchronous,
+    how: Synchronisation = Synchronisation.HOLD_BOTH,
+    settings: FilterSettings | None = None,
+) -> Runs:
+    """Simulate sensors of different rates and filter every run; the result has one column an image.
+
+    Args:
+        scenario: what is simulated.
+        how: what the filter takes for the speeds between two messages.
+        settings: of the filter; default: the plain filter with the scenario's noise.
+    """
+    s = scenario.base
+    settings = settings or s.settings()
+    frame_s = scenario.frame_s()
+    count = round(scenario.duration_s / FINE_S)
+    middle = np.asarray(FINE_S * (np.arange(count) + 0.5), dtype=np.float64)
+    point = np.asarray(s.landmark_m, dtype=np.float64)
+    path: list[Floats] = []
+    for k, (omega, speed) in enumerate(zip(scenario.omega_at(middle), scenario.speed_at(middle), strict=True)):
+        if len(path) < len(frame_s) and k >= round(frame_s[len(path)] / FINE_S):
+            path.append(point)
+        point = eq.carried(point, eq.held(omega, speed, FINE_S))
+    path.append(point)
+    truth = eq.project(np.array(path), s.focal_px, s.centre_px)
+    rng = rng_of(s.seed, "asynchronous")
+
+    def measured(hz: float, sigma: float, profile: Callable[[Floats], Floats]) -> tuple[Floats, Floats]:
+        times = np.arange(round(scenario.duration_s * hz) + 1) / hz
+        return times, profile(times) + sigma * math.sqrt(hz) * rng.standard_normal((s.runs, len(times)))
+
+    gyro = measured(scenario.gyro_hz, s.sigma_omega, scenario.omega_at)
+    odometer = measured(scenario.odometer_hz, s.sigma_speed, scenario.speed_at)
+    pixel = truth[:, :2] + s.pixel_sigma * rng.standard_normal((s.runs, len(frame_s), 2))
+    found = intervals(*gyro, *odometer, frame_s, how)
+    points = np.where((found.frame >= 0)[:, None], pixel[:, found.frame], np.nan)
+    start = starts(s, pixel)
+    history = np.empty((s.runs, len(found.dt), kernels.HISTORY))
+    kernels.advance_runs(
+        settings.model(s.focal_px, s.centre_px),
+        start,
+        np.ascontiguousarray(np.broadcast_to(found.omega, history.shape[:2])),
+        np.ascontiguousarray(np.broadcast_to(found.speed, history.shape[:2])),
+        found.dt,
+        np.zeros(history.shape[:2], np.bool_),
+        np.ascontiguousarray(points),
+        settings.pixel_sigma**2,
+        history,
+    )
+    rows = history[:, found.frame >= 0]
+    state = np.concatenate([start[:, None], rows[..., : kernels.STATE]], axis=1)
+    nis, outcome = (
+        np.concatenate([np.full((s.runs, 1), first), rows[..., kernels.STATE + i]], axis=1)
+        for i, first in enumerate((np.nan, float(kernels.PREDICTED)))
+    )
+    base = replace(s, dt=1.0 / scenario.camera_hz, steps=len(frame_s) - 1)
+    return Runs(base, settings, truth[None], state[..., :3], full_covariance(state[..., 3:]), nis, outcome)
