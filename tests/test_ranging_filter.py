@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from plain_range_filter import flow, step
+from plain_range_filter import derivative, flow, step
 from pydantic import ValidationError
 from scipy.optimize import least_squares
 
@@ -189,15 +189,16 @@ def one(state=(340.0, 280.0, 0.1), sigma=(0.5, 0.5, 0.01)) -> Landmarks:
 
 def test_gate_rejects_and_the_third_rejection_resets() -> None:
     model = FilterSettings().model(F, CENTRE)
-    now, still = one(), Inputs(0.0, 0.0, 0.1)
+    now, turning = one(), Inputs(0.001, 0.0, 0.1)
     sigma = now.covariance[0, 2, 2]
     wild = np.array([[400.0, 200.0]])
     for k in range(3):
-        now, update = rf.step(model, now, still, wild, 0.25)
+        now, update = rf.step(model, now, turning, wild, 0.25)
         assert update.nis[0] > 13.8
         assert update.outcome[0] == (Outcome.REJECTED if k < 2 else Outcome.RESET)
         if k < 2:
             assert now.rejections[0] == k + 1
+            assert now.turn_rad[0] == pytest.approx(1e-4 * (k + 1))
             np.testing.assert_array_equal(update.mean, update.prior)
             assert rf.statuses(update)[0] == Status.REJECTED
     assert rf.statuses(update)[0] == Status.RESET
@@ -384,6 +385,19 @@ def test_start_from_two_views() -> None:
     )
     with pytest.raises(ValueError, match="the other view does not place"):
         start.from_two_views(model, first - (x[:2] - first), first, 0.04, motion(np.zeros(steps), speeds))
+
+
+def test_covariance_of_the_cameras_motion_is_that_of_the_speeds() -> None:
+    """Two intervals; the covariance against differences of (turn, x, z) with respect to each speed."""
+    q = np.array([0.3, 0.2])
+    given = np.array([0.4, 0.5, -0.2, 0.7])
+
+    def motion(v):
+        first = start.CameraMotion.none().then(eq.held(v[0], v[1], 0.5), *q)
+        return first.then(eq.held(v[2], v[3], 0.8), *q)
+
+    slope = derivative(lambda v: np.array([motion(v).turn_rad, *motion(v).shift_m]), given, [1e-5] * 4)
+    np.testing.assert_allclose(motion(given).covariance, slope @ np.diag([*q, *q]) @ slope.T, rtol=1e-7)
 
 
 def test_landmarks_join_and_part() -> None:
