@@ -97,7 +97,7 @@ def smooth(
     def cost_of(first: Floats, error: Floats) -> tuple[float, Floats, Floats, Floats]:
         path, a, g = np.empty((m + 1, n, 3)), np.empty((m, n, 3, 3)), np.empty((m, n, 3, 2))
         path[0] = first
-        if not _roll_out(model, path, omega, speed, dt, error, a, g):
+        if not (first[:, 2] > 0.0).all() or not _roll_out(model, path, omega, speed, dt, error, a, g):
             return np.inf, path, a, g
         off = (first - prior).ravel()
         misfit = np.nansum((pixels - path[1:, :, :2]) ** 2 / variance[:, None])
@@ -140,10 +140,10 @@ def _roll_out(
 ) -> bool:
     """Fill `path` [m + 1, N, 3] from its first frame on, A and G; False where a landmark comes behind the camera."""
     for k in range(len(omega)):
-        path[k + 1] = path[k]
+        _copy(path[k], path[k + 1])
         if not linearise_all(model, path[k + 1], omega[k] - error[k, 0], speed[k] - error[k, 1], dt[k], a[k], g[k]):
             return False
-    return bool((path[:, :, 2] > 0.0).all())
+    return True
 
 
 @_jit
@@ -178,7 +178,7 @@ def _linear_smoother(
     start_mean = mean.copy()
     for k in range(m):
         if wanted:
-            predicted[k] = p
+            _copy(p, predicted[k])
         for i in range(n):
             for r in range(3):
                 moved[r] = -g[k, i, r, 0] * error[k, 0] - g[k, i, r, 1] * error[k, 1]
@@ -194,11 +194,11 @@ def _linear_smoother(
             innovation[k, i, 0], innovation[k, i, 1] = du, dv
             if np.isfinite(du) and np.isfinite(dv):
                 rank_two_update(mean, p, at, du, dv, variance[i], gain[k, i], inverse[k, i])
-    if wanted:
-        predicted[m] = p
-        _put_blocks(p, covariance[m])
     back, inside = np.zeros(d), np.zeros((d, d))
-    old = np.empty(3)
+    if wanted:
+        _copy(p, predicted[m])
+        _put_blocks(predicted[m], inside, covariance[m])
+    old, turned, no_gain, no_error = np.empty(3), np.empty((n, 3, 3)), np.zeros((n, 3, 2)), np.zeros(2)
     for k in range(m - 1, -1, -1):
         for i in range(n - 1, -1, -1):
             du, dv = innovation[k, i, 0], innovation[k, i, 1]
@@ -226,8 +226,8 @@ def _linear_smoother(
             for c in range(3):
                 back[3 * i + c] = old[c]
         if wanted:
-            blocks_ahead(inside, a[k].transpose(0, 2, 1), np.zeros((n, 3, 2)), np.zeros(2))
-            _put_blocks(predicted[k] - predicted[k] @ inside @ predicted[k], covariance[k])
+            blocks_ahead(inside, _transposed(a[k], turned), no_gain, no_error)
+            _put_blocks(predicted[k], inside, covariance[k])
     for r in range(d):
         shift[r] = start_mean[r]
         for c in range(d):
@@ -237,10 +237,18 @@ def _linear_smoother(
 @_jit
 def _information_through_update(inside: Floats, gain: Floats, inverse: Floats, at: int) -> None:
     """Λ ← (I - K H)ᵀ Λ (I - K H) + Hᵀ S⁻¹ H, in place, for the image point at rows `at`, `at` + 1."""
-    through = inside @ gain
-    core = gain.T @ through + inverse
+    d = len(inside)
+    through, core = np.zeros((d, 2)), inverse.copy()
+    for r in range(d):
+        for k in range(d):
+            through[r, 0] += inside[r, k] * gain[k, 0]
+            through[r, 1] += inside[r, k] * gain[k, 1]
+    for r in range(2):
+        for c in range(2):
+            for k in range(d):
+                core[r, c] += gain[k, r] * through[k, c]
     for c in range(2):
-        for r in range(len(inside)):
+        for r in range(d):
             inside[r, at + c] -= through[r, c]
             inside[at + c, r] -= through[r, c]
     for r in range(2):
@@ -249,8 +257,37 @@ def _information_through_update(inside: Floats, gain: Floats, inverse: Floats, a
 
 
 @_jit
-def _put_blocks(p: Floats, out: Floats) -> None:
+def _put_blocks(p: Floats, inside: Floats, out: Floats) -> None:
+    """The diagonal blocks of P - P Λ P, into `out` [N, 9]."""
+    d = len(p)
+    half = np.empty((d, 3))
     for i in range(len(out)):
+        for r in range(d):
+            for c in range(3):
+                half[r, c] = 0.0
+                for k in range(d):
+                    half[r, c] += inside[r, k] * p[k, 3 * i + c]
         for r in range(3):
             for c in range(3):
-                out[i, 3 * r + c] = p[3 * i + r, 3 * i + c]
+                value = p[3 * i + r, 3 * i + c]
+                for k in range(d):
+                    value -= p[3 * i + r, k] * half[k, c]
+                out[i, 3 * r + c] = value
+
+
+@_jit
+def _transposed(a: Floats, out: Floats) -> Floats:
+    """Aᵀ of each landmark, into `out` [N, 3, 3]."""
+    for i in range(len(a)):
+        for r in range(3):
+            for c in range(3):
+                out[i, c, r] = a[i, r, c]
+    return out
+
+
+@_jit
+def _copy(source: Floats, target: Floats) -> None:
+    """Element by element: quicker to compile than an assignment of slices."""
+    for i in range(source.shape[0]):
+        for j in range(source.shape[1]):
+            target[i, j] = source[i, j]
