@@ -26,7 +26,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.simulation import faults
 from pipelines.simulation import trajectories as ways
-from pipelines.simulation.mission import POSE, nadir_camera, nadir_mission
+from pipelines.simulation.mission import POSE, SimulatedMission, nadir_camera, nadir_mission
 from pipelines.simulation.surfaces import tiles
 from readers import ReadOptions, open_recording
 from readers.streams import (
