@@ -877,7 +877,7 @@ def test_evo_reads_the_trajectory_of_a_log(tmp_path: Path, container: str, missi
     with (Ros1Reader if container == "ros1" else Ros2Reader)(path) as reader:
         way = file_interface.read_bag_trajectory(reader, POSE)
     np.testing.assert_array_equal(way.positions_xyz[:, :2], mission.truth_poses[:, :2])
-    np.testing.assert_array_equal(way.positions_xyz[:, 2], mission.height_m)
+    np.testing.assert_array_equal(way.positions_xyz[:, 2], mission.on_board[0].heights_m)
     np.testing.assert_allclose(way.timestamps, mission.truth_t_ns / 1e9, rtol=0, atol=3e-7)
 
 
@@ -903,7 +903,7 @@ def test_pandas_and_opencv_read_the_folders(tmp_path: Path, mission: SimulatedMi
     table = pd.read_csv(tmp_path / "speed_2" / "file.csv")
     np.testing.assert_allclose(table["x [cm]"], mission.truth_poses[:, 0] * 100, rtol=0, atol=1e-13)
     np.testing.assert_allclose(table["y [cm]"], mission.truth_poses[:, 1] * -100, rtol=0, atol=1e-13)
-    np.testing.assert_allclose(table["distance to the surface [cm]"], mission.height_m * 100, rtol=1e-15)
+    np.testing.assert_allclose(table["distance to the surface [cm]"], mission.on_board[0].heights_m * 100, rtol=1e-15)
     yaw = np.unwrap(np.radians(table["yaw [deg]"]))
     np.testing.assert_allclose(yaw, -np.unwrap(mission.truth_poses[:, 2]), rtol=0, atol=1e-14)
     for k in range(len(table)):
