@@ -489,13 +489,16 @@ def square(side_m: float = 2.0, corner_m: float = 0.3, ease: float = 0.0) -> Cur
     return polyline(points, corner_m, ease, closed=True)
 
 
-def figure_eight(length_m: float = 3.45, width_m: float = 1.37) -> Curve:
-    """The figure eight (length sin t, width sin 2t) of the paper's test, 19 m a round; it crosses itself."""
+def figure_eight(length_m: float = 3.45, width_m: float = 1.37, start_rad: float = 0.0) -> Curve:
+    """The figure eight (length sin t, width sin 2t) of the paper's test, 19 m a round; it crosses itself.
+
+    It starts at t = `start_rad`, at the crossing for 0.
+    """
     _demand(length_m != 0 and width_m != 0, f"a figure eight of {length_m} m by {width_m} m")
-    return Waves(
-        [Wave(1.0, (0.0, 0.0), (length_m, 0.0)), Wave(2.0, (0.0, 0.0), (0.0, width_m))],
-        end=2 * math.pi,
-    )
+    sin, cos, sin2, cos2 = (f(k * start_rad) for k in (1, 2) for f in (math.sin, math.cos))
+    long = Wave(1.0, (length_m * sin, 0.0), (length_m * cos, 0.0))
+    wide = Wave(2.0, (0.0, width_m * sin2), (0.0, width_m * cos2))
+    return Waves([long, wide], end=2 * math.pi)
 
 
 def spiral(start_m: float = 0.5, pitch_m: float = 0.6) -> Curve:

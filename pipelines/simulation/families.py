@@ -44,6 +44,7 @@ Rng = np.random.Generator
 
 SIZE_STEP_PX = 256  # every period divides it
 FINEST, COARSEST = 1 / 4, 1 / 64  # cycles per px between which the spectrum's slope is taken
+FADING = 0.1  # cycles per px: above `FINEST` the amplitude falls as a Gaussian of this width, as in real frames
 JOINT_PX = 8  # joints begin on the first line of a paver or board, and hide the band between two cells
 BOARD_PX = 128
 PAVER_PX = (128, 256)
@@ -166,16 +167,17 @@ def _pattern(family: Family, rng: Rng) -> Floats:
 def _tempered(texture: Floats, pattern: Floats, contrast: float, share: float, slope: float) -> Floats:
     """√(1 - share) of the texture and √share of the pattern, of that spectral slope and contrast.
 
-    Both are filtered by one factor f^-e, and each is brought to unit variance after it; e is corrected by
-    what the slope of the sum still lacks.
+    Both are filtered by one factor f^-e, which fades out above `FINEST`, and each is brought to unit variance
+    after it; e is corrected by what the slope of the sum still lacks.
     """
     size = len(texture)
     frequency = _frequency(size)
     log_f = np.log(np.maximum(frequency, COARSEST))
+    fading = 0.5 * (np.maximum(frequency - FINEST, 0) / FADING) ** 2
     parts = [scipy.fft.rfft2(part) for part in (texture, pattern)]
     exponent = 0.0
     for _ in range(4):
-        gain = np.exp(-exponent * log_f)
+        gain = np.exp(-exponent * log_f - fading)
         gain[0, 0] = 0
         mixed = np.zeros_like(parts[0])
         for part, weight in zip(parts, (1 - share, share), strict=True):

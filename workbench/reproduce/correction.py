@@ -15,7 +15,7 @@ from pipelines.correlation.settings import CorrelationSettings
 from pipelines.geometry import Floats
 from pipelines.simulation import trajectories as way
 from pipelines.simulation.channels import rng_of
-from workbench.reproduce.conditions import FRAMES, METRES_PER_PX, RATE_HZ, SPEED_MPS, fluctuation
+from workbench.reproduce.conditions import FRAMES, METRES_PER_PX, RATE_HZ, SPEED_MPS, START_RAD, fluctuation
 from workbench.reproduce.estimates import dead_reckoned, settings_of, variants
 from workbench.reproduce.measures import rms
 
@@ -94,7 +94,7 @@ def _measured(truth: Truth, seed: int, frames: int) -> tuple[Floats, Floats, Flo
     rng = rng_of(seed, "correction", truth.name)
     speeds = way.jittery_speed(frames, SPEED_MPS, rng) if truth.jitter else np.full(frames, SPEED_MPS)
     lengths = (speeds * way.ramp(frames, truth.ramp_frames))[:-1] / RATE_HZ
-    poses = way.follow(way.figure_eight(), lengths)
+    poses = way.follow(way.figure_eight(start_rad=START_RAD), lengths)
     shift, turn = way.image_motion(poses, METRES_PER_PX)
     shift = shift / (1 + fluctuation(frames - 1, truth.height_share, rng))[:, None]
     noisy_shift = shift + rng.normal(0, SHIFT_NOISE_PX, shift.shape)
