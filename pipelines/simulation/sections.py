@@ -119,7 +119,7 @@ AnyFault = Annotated[Any, PlainValidator(fault_of), PlainSerializer(fault_values
 class Ground(Section):
     """The ground at z = 0."""
 
-    family: str = Field("gravel", description="family of the texture, see families.py")
+    family: str = Field("gravel", description="family of the texture: gravel, wood, … (docs/simulation-surfaces.md)")
     contrast: Positive | None = Field(None, description="gradient rms, grey levels per px; None: the family's own")
     repetition: Share | None = Field(None, description="share of it that repeats; None: the family's own")
     spectrum: NotNegative | None = Field(None, description="β of its spectrum ~ f^-β; None: the family's own")
@@ -135,10 +135,10 @@ class Ground(Section):
 class Trajectory(Section):
     """The way of the vehicle's turning point, and how fast it goes along it."""
 
-    curve: str = Field("figure-eight", description="name of the curve, see curves.py")
+    curve: str = Field("figure-eight", description="name of the curve: line, circle, lanes, … (docs/scenarios.md)")
     parameters: Parameters = Field({}, description="parameters of the curve")
     speed_kmh: Finite = Field(2.0, description="speed, km/h; negative drives in reverse")
-    profile: str = Field("jitter", description="how the speed varies, see speeds.py")
+    profile: str = Field("jitter", description="how the speed varies: constant, jitter, … (docs/scenarios.md)")
     profile_parameters: Parameters = Field({}, description="parameters of the profile")
     stops: tuple[tuple[Finite, Finite], ...] = Field((), description="stops: time at which each begins, and length, s")
     stop_ramp_s: Positive = Field(0.5, description="time of slowing down before and of speeding up after a stop")
@@ -164,7 +164,7 @@ class CameraSection(Section):
     width_px: Count = Field(PAPER_SIDE_PX, description="columns of the image")
     height_px: Count = Field(PAPER_SIDE_PX, description="rows of the image")
     focal_px: Positive = Field(PAPER_FOCAL_PX, description="focal length")
-    distortion_model: str = Field("plumb_bob", description="ROS name of the lens model, see lens.py")
+    distortion_model: str = Field("plumb_bob", description="lens: none, plumb_bob, rational_polynomial, equidistant")
     distortion: tuple[Finite, ...] = Field((), description="its coefficients; those left out are 0")
     timing: Clock = Field(Timing(rate_hz=60.0), description="when it takes pictures, and what becomes of them")
     height_m: Positive = Field(PAPER_HEIGHT_M, description="height above the ground, the body being level")
