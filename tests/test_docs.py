@@ -3,7 +3,6 @@
 import re
 from pathlib import Path
 
-
 from pipelines.simulation.scenario import Scenario
 from pipelines.simulation.sections import is_section, meanings
 from workbench import scenario_page, scenarios
