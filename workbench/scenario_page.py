@@ -20,17 +20,7 @@ from pipelines.simulation.curves import CURVES
 from pipelines.simulation.families import FAMILIES
 from pipelines.simulation.faults import FAULTS
 from pipelines.simulation.scenario import Scenario
-from pipelines.simulation.sections import (
-    Chessboard,
-    DownCamera,
-    Fluctuation,
-    FrontCamera,
-    Ground,
-    Surroundings,
-    Trajectory,
-    meanings,
-)
-from pipelines.simulation.sensors import Gnss, Height, Imu, Odometer, Reference, Tracks
+from pipelines.simulation.sections import DownCamera, FrontCamera, meanings
 from pipelines.simulation.speeds import SPEEDS
 from pipelines.simulation.timing import Timing
 from workbench import scenarios
@@ -46,22 +36,6 @@ Keys end in their unit: `_m`, `_px`, `_s`, `_rad`, `_radps` (rad/s), `_mps`, `_m
 levels, 0…255), `_kmh`. World and body: z up, x forward, y left, headings counter-clockwise.
 """
 
-SECTIONS: Mapping[str, type] = {
-    "ground": Ground,
-    "trajectory": Trajectory,
-    "body": Fluctuation,
-    "camera": DownCamera,
-    "front": FrontCamera,
-    "surroundings": Surroundings,
-    "surroundings.chessboard": Chessboard,
-    "imu": Imu,
-    "odometer": Odometer,
-    "reference": Reference,
-    "height": Height,
-    "tracks": Tracks,
-    "gnss": Gnss,
-}
-
 
 def document() -> str:
     """The text of `docs/scenarios.md`."""
@@ -73,11 +47,12 @@ def _blocks() -> Iterator[Iterable[str]]:
     yield ["## Scenarios by name", "`workbench simulate NAME`, or `sim:NAME` wherever a recording can stand.", ""]
     yield _table(("Scenario", "About"), ((f"`{name}`", scenarios.about(name)) for name in scenarios.names()))
     yield ["", "## At the top of the file", "What is not a section; before the first `[section]` of a TOML file.", ""]
-    inner = {*SECTIONS, "truth", "faults"}
+    inner = {*(name for name, _, _ in _sections(Scenario)), "truth", "faults"}
     yield _keys(Scenario, [key for key in Scenario.model_fields if key not in inner])
     yield ["", "## Sections", _about_sections(), ""]
-    for name, kind in SECTIONS.items():
-        yield _section(name, kind)
+    for name, kind, listed in _sections(Scenario):
+        yield [f"### `[[{name}]]`" if listed else f"### `[{name}]`", _first_paragraph(kind), ""]
+        yield _section(kind)
     yield ["### `[truth]`, and `timing` of every camera and sensor", _first_paragraph(Timing), ""]
     yield _keys(Timing)
     yield ["", "## Curves", "`trajectory.curve`, and `trajectory.parameters` with their defaults. Lengths in m.", ""]
@@ -92,8 +67,31 @@ def _blocks() -> Iterator[Iterable[str]]:
     yield _table(("Fault", "Parameters", "What"), (_fault(name) for name in FAULTS))
 
 
+def _sections(kind: type, above: str = "") -> Iterator[tuple[str, type, bool]]:
+    """The sections within a section by their full names, and whether there is a list of them; and those within them."""
+    for key, annotation in get_type_hints(kind, include_extras=True).items():
+        parts = list(_parts(annotation))
+        inner = next((part for part in parts if _has_keys(part)), None)
+        if inner is not None and inner is not Timing:
+            yield above + key, inner, any(get_origin(part) is tuple for part in parts)
+            yield from _sections(inner, f"{above}{key}.")
+
+
+def _parts(annotation: Any) -> Iterator[Any]:
+    """A type, and the types that it is made of."""
+    yield annotation
+    for argument in get_args(annotation):
+        yield from _parts(argument)
+
+
+def _has_keys(part: Any) -> bool:
+    return isinstance(part, type) and (issubclass(part, BaseModel) or dataclasses.is_dataclass(part))
+
+
 def _about_sections() -> str:
-    optional = [name for name in SECTIONS if "." not in name and Scenario.model_fields[name].default is None]
+    optional = [
+        name for name, _, _ in _sections(Scenario) if "." not in name and Scenario.model_fields[name].default is None
+    ]
     return (
         f"{_listed(optional)} and `truth`\n"
         "are on board only if the scenario has the section; an empty one takes the defaults."
@@ -114,10 +112,7 @@ def _about_faults() -> str:
     )
 
 
-def _section(name: str, kind: type) -> Iterator[str]:
-    yield f"### `[{name}]`"
-    yield _first_paragraph(kind)
-    yield ""
+def _section(kind: type) -> Iterator[str]:
     if kind is not FrontCamera:
         yield from _keys(kind)
     else:

@@ -62,7 +62,9 @@ def _trajectory(axes: Axes, name: str, way: Curve, length_m: float) -> None:
     length_m = min(length_m, way.length_m)
     x, y = way.along(0.0, length_m)(np.linspace(0, length_m, 1200)).point_m
     points = np.stack([x, y], axis=-1)
-    pieces = LineCollection(np.stack([points[:-1], points[1:]], axis=1).tolist(), cmap="viridis", lw=2.2, capstyle="round")
+    pieces = LineCollection(
+        np.stack([points[:-1], points[1:]], axis=1).tolist(), cmap="viridis", lw=2.2, capstyle="round"
+    )
     pieces.set_array(np.linspace(0, 1, len(points) - 1))
     axes.add_collection(pieces)
     axes.plot(x[0], y[0], "o", color="#1a9850", ms=7, zorder=3)
@@ -86,7 +88,11 @@ def _trajectory(axes: Axes, name: str, way: Curve, length_m: float) -> None:
 NADIR = ("ground.family=street", "ground.size_px=1024", "camera.noise_grey=1", "frames=150")
 VIEWS: Mapping[str, tuple[str, int, tuple[str, ...]]] = {
     "nadir, 2 km/h\n": ("line", 120, NADIR),
-    "motion blur, 8 km/h\nexposure_s = 0.015": ("line", 120, (*NADIR, "camera.exposure_s=0.015", "trajectory.speed_kmh=8")),
+    "motion blur, 8 km/h\nexposure_s = 0.015": (
+        "line",
+        120,
+        (*NADIR, "camera.exposure_s=0.015", "trajectory.speed_kmh=8"),
+    ),
     "rolling shutter, 8 km/h in a sharp turn\nreadout_s = 0.016": (
         "line",
         120,

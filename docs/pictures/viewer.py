@@ -75,7 +75,9 @@ def _ready(viewer: subprocess.Popen[bytes], port: int) -> ViewerClient:
 
 def _bring_to_front(client: ViewerClient, tab: str) -> None:
     blueprint = client.get_blueprint().blueprint
-    containers = {path: parts["ContainerBlueprint"] for path, parts in blueprint.items() if "ContainerBlueprint" in parts}
+    containers = {
+        path: parts["ContainerBlueprint"] for path, parts in blueprint.items() if "ContainerBlueprint" in parts
+    }
     (wanted,) = (path for path, parts in containers.items() if parts.get("display_name") == tab)
     for parts in containers.values():
         if wanted in parts["contents"]:
