@@ -126,9 +126,9 @@ class Ground(Section):
     """The ground at z = 0."""
 
     family: str = Field("gravel", description="family of the texture: gravel, wood, … (docs/simulation-surfaces.md)")
-    contrast: Positive | None = Field(None, description="gradient rms, grey levels per px; None: the family's own")
-    repetition: Share | None = Field(None, description="share of it that repeats; None: the family's own")
-    spectrum: NotNegative | None = Field(None, description="β of its spectrum ~ f^-β; None: the family's own")
+    contrast: Positive | None = Field(None, description="gradient rms, grey levels per px; otherwise the family's own")
+    repetition: Share | None = Field(None, description="share of it that repeats; otherwise the family's own")
+    spectrum: NotNegative | None = Field(None, description="β of its spectrum ~ f^-β; otherwise the family's own")
     size_px: Count = Field(1024, description="side of the picture that the ground is laid of, a multiple of 256")
     picture: str = Field("", description="picture file that the ground is made of, in place of a family")
     arrange: Literal["mirror", "scatter"] = Field("scatter", description="how the picture becomes endless ground")
