@@ -222,6 +222,7 @@ def test_every_key_is_described() -> None:
         ("frames=0", "frames = 0: input should be greater than 0"),
         ("imu.timing.rate=3", "unknown key 'rate'; did you mean rate_hz?"),
         ("imu.timing.rate_hz=0", "rate_hz is 0.0, it must be above 0"),
+        ("truth={}", "truth.rate_hz must be given"),
         ("imu.gyro_density=-1", "gyro_density is -1.0, it must be 0 or more"),
         ("faults.0.gian=1", "exposure-jump: unknown key 'gian'; did you mean gain?"),
         ("faults.0.gain=bright", "exposure-jump: gain: Input should be a valid number"),
@@ -265,6 +266,16 @@ def test_what_cannot_be_built_names_the_section(override: str, text: str) -> Non
     loaded = scenarios.load("fault-exposure-jump", overrides=["ground.size_px=256", override])
     with pytest.raises((SettingsError, RecordingError), match=text):
         scenarios.mission(loaded)
+
+
+def test_a_clock_keeps_the_usual_rate(tmp_path: Path) -> None:
+    late = ("imu.timing.latency_s=0.1", "camera.timing.latency_s=0.2", "front.timing.start_s=1")
+    file = tmp_path / "mine.toml"
+    file.write_text("\n".join(late))
+    for scenario in (scenarios.load("line", overrides=late).scenario, scenarios.load(str(file)).scenario):
+        assert (scenario.imu.timing.rate_hz, scenario.imu.timing.latency_s) == (100, 0.1)
+        assert (scenario.camera.timing.rate_hz, scenario.camera.timing.latency_s) == (60, 0.2)
+        assert (scenario.front.timing.rate_hz, scenario.front.timing.start_s) == (5, 1)
 
 
 def test_files_that_are_no_scenario(tmp_path: Path) -> None:

@@ -90,6 +90,10 @@ def test_inspect_opens_a_scenario(capsys: pytest.CaptureFixture[str]) -> None:
         (["line", "-o", "a.mcap", "--as", "zip"], "no container is named 'zip'"),
         (["line", "-o", "a.xyz"], "name the container"),
         (["line", "--picture", "none.png", "-o", "a.mcap"], "the picture of the ground cannot be read"),
+        (
+            ["paper-b", "--set", "ground.relief_height_m=0.001", "-o", "a.mcap"],
+            "/front/image_raw, frame 0: a relief of slope",
+        ),
     ],
 )
 def test_refusals_are_one_line(words: list[str], text: str, capsys: pytest.CaptureFixture[str]) -> None:

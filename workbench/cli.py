@@ -360,6 +360,7 @@ def _print_summary(outcome: Outcome) -> None:
     epilog=_examples(
         "workbench simulate --list",
         "workbench simulate fault-motion-blur -o blur.mcap",
+        "workbench simulate fault-motion-blur --set faults.0.exposure=0.5 --replay",
         "workbench simulate paper-a --set camera.noise_grey=5 --seed 3 -o mission.bag",
         "workbench simulate paper-a --as paper-a -o folder/",
         "workbench simulate line --picture floor.png --replay --preset paper-a",
@@ -378,26 +379,28 @@ def simulate(
     seed: Annotated[int | None, typer.Option(help="Seed of everything random [the scenario's].")] = None,
     picture: Annotated[Path | None, typer.Option(metavar="FILE", help="Picture that the ground is made of.")] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", metavar="PATH", help="File or folder to write, or of the results.")
+        Path | None,
+        typer.Option("--out", "-o", metavar="PATH", help="File or folder to write; of --replay, of its results."),
     ] = None,
     container: Annotated[
         str | None,
-        typer.Option("--as", metavar="CONTAINER", help="mcap, mcap-json, ros1, ros2, paper-a, euroc [by suffix]."),
+        typer.Option("--as", metavar="CONTAINER", help="mcap, mcap-json, ros1, ros2, paper-a, euroc [by .mcap, .bag]."),
     ] = None,
     images: Annotated[
         str | None, typer.Option(metavar="FORM", help="Images as jpeg, png or stored [jpeg; png in folders].")
     ] = None,
     listed: Annotated[bool, typer.Option("--list", help="List the scenarios.")] = False,
-    show: Annotated[bool, typer.Option("--show", help="Print the scenario with all its keys as TOML.")] = False,
+    show: Annotated[bool, typer.Option("--show", help="Print it with all keys, a TOML file to start from.")] = False,
     replayed: Annotated[bool, typer.Option("--replay", help="Replay it without a file in between.")] = False,
     estimator: Annotated[str, typer.Option("--estimator", "-e", help="Estimator of --replay.")] = "correlation",
-    preset: Annotated[str | None, typer.Option(help="Preset of its settings.")] = None,
+    preset: Annotated[str | None, typer.Option(help="Preset of its settings, such as best or paper-a.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a simulated mission: write it as a recording, or replay it directly.
 
     A scenario says what the ground, the way, the sensors and the faults are. The recording carries the list of its
     faults in /truth/faults. Same scenario, same seed: same bytes. Ctrl-C ends the file early and keeps it readable.
+    docs/simulation.md explains, docs/scenarios.md has every key.
     """
     from workbench import scenarios
     from workbench.settings import SettingsError

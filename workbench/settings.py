@@ -269,6 +269,8 @@ def _explain(errors: Sequence[ErrorDetails], model: type[BaseModel], layers: Seq
     more = f" (and {len(errors) - 1} more)" if len(errors) > 1 else ""
     if first["type"] == "extra_forbidden":
         return f"{origin}: unknown setting {key!r}; {_hint(path[-1], _known(model, path[:-1]))}{more}"
+    if first["type"] == "missing":
+        return f"{origin}: {key} must be given{more}"
     message = first["msg"].removeprefix("Value error, ")
     if not path:
         return f"{origin}: {message}{more}"

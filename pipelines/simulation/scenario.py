@@ -84,7 +84,7 @@ class Scenario(Section):
     name: str = Field("scenario", min_length=1, description="name of the mission")
     about: str = Field("", description="what it shows, one line")
     seed: int = Field(0, ge=0, description="seed of everything random")
-    duration_s: Positive | None = Field(None, description="length; None: that of the speed profile, or 8 s")
+    duration_s: Positive | None = Field(None, description="length; otherwise that of the speed profile, or 8 s")
     frames: Count | None = Field(None, description="length in frames of the first camera; overrides duration_s")
     start_ns: int = Field(START_NS, ge=0, description="time of the start, ns since 1970")
     ground: Ground = Field(Ground(), description="the ground")

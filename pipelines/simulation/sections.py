@@ -55,21 +55,27 @@ def hint(wrong: str, known: list[str]) -> str:
     return f"did you mean {' or '.join(near)}?" if near else f"known are: {', '.join(known)}"
 
 
-def _without_unknown_keys(kind: type, values: Any) -> Any:
-    """Refuse keys that a dataclass, or a dataclass within it, does not have."""
+def _completed(kind: type, values: Any, usual: Mapping[str, Any]) -> Any:
+    """The values of a dataclass, those left out as `usual`; in a dataclass within it they are its default's.
+
+    Raises:
+        ValueError: a key that the dataclass does not have.
+    """
     if not isinstance(values, Mapping):
         return values
-    types = get_type_hints(kind)
+    types, defaults = get_type_hints(kind), {field.name: field.default for field in dataclasses.fields(kind)}
+    complete = {**usual, **values}
     for key, value in values.items():
         if key not in types:
             raise ValueError(f"unknown key {key!r}; {hint(str(key), list(types))}")
-        if dataclasses.is_dataclass(types[key]) and isinstance(types[key], type):
-            _without_unknown_keys(types[key], value)
-    return values
+        default = defaults[key]
+        if dataclasses.is_dataclass(default) and not isinstance(default, type):
+            complete[key] = _completed(types[key], value, dataclasses.asdict(default))
+    return complete
 
 
-def _known(kind: type) -> BeforeValidator:
-    return BeforeValidator(lambda values: _without_unknown_keys(kind, values))
+def _known(kind: type, **usual: Any) -> BeforeValidator:
+    return BeforeValidator(lambda values: _completed(kind, values, usual))
 
 
 Clock = Annotated[Timing, _known(Timing)]
@@ -93,7 +99,7 @@ def fault_of(values: Any) -> Fault:
         raise ValueError(f"no fault is named {name!r}; {hint(str(name), list(FAULTS))}")
     kind = FAULTS[name]
     try:
-        fault = TypeAdapter(kind).validate_python(_without_unknown_keys(kind, parameters))
+        fault = TypeAdapter(kind).validate_python(_completed(kind, parameters, {}))
     except ValidationError as error:
         first = error.errors()[0]
         raise ValueError(f"{name}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
@@ -119,10 +125,10 @@ AnyFault = Annotated[Any, PlainValidator(fault_of), PlainSerializer(fault_values
 class Ground(Section):
     """The ground at z = 0."""
 
-    family: str = Field("gravel", description="family of the texture, see families.py")
-    contrast: Positive | None = Field(None, description="gradient rms, grey levels per px; None: the family's own")
-    repetition: Share | None = Field(None, description="share of it that repeats; None: the family's own")
-    spectrum: NotNegative | None = Field(None, description="β of its spectrum ~ f^-β; None: the family's own")
+    family: str = Field("gravel", description="family of the texture: gravel, wood, … (docs/simulation-surfaces.md)")
+    contrast: Positive | None = Field(None, description="gradient rms, grey levels per px; otherwise the family's own")
+    repetition: Share | None = Field(None, description="share of it that repeats; otherwise the family's own")
+    spectrum: NotNegative | None = Field(None, description="β of its spectrum ~ f^-β; otherwise the family's own")
     size_px: Count = Field(1024, description="side of the picture that the ground is laid of, a multiple of 256")
     picture: str = Field("", description="picture file that the ground is made of, in place of a family")
     arrange: Literal["mirror", "scatter"] = Field("scatter", description="how the picture becomes endless ground")
@@ -135,10 +141,10 @@ class Ground(Section):
 class Trajectory(Section):
     """The way of the vehicle's turning point, and how fast it goes along it."""
 
-    curve: str = Field("figure-eight", description="name of the curve, see curves.py")
+    curve: str = Field("figure-eight", description="name of the curve: line, circle, lanes, … (docs/scenarios.md)")
     parameters: Parameters = Field({}, description="parameters of the curve")
     speed_kmh: Finite = Field(2.0, description="speed, km/h; negative drives in reverse")
-    profile: str = Field("jitter", description="how the speed varies, see speeds.py")
+    profile: str = Field("jitter", description="how the speed varies: constant, jitter, … (docs/scenarios.md)")
     profile_parameters: Parameters = Field({}, description="parameters of the profile")
     stops: tuple[tuple[Finite, Finite], ...] = Field((), description="stops: time at which each begins, and length, s")
     stop_ramp_s: Positive = Field(0.5, description="time of slowing down before and of speeding up after a stop")
@@ -164,9 +170,11 @@ class CameraSection(Section):
     width_px: Count = Field(PAPER_SIDE_PX, description="columns of the image")
     height_px: Count = Field(PAPER_SIDE_PX, description="rows of the image")
     focal_px: Positive = Field(PAPER_FOCAL_PX, description="focal length")
-    distortion_model: str = Field("plumb_bob", description="ROS name of the lens model, see lens.py")
+    distortion_model: str = Field("plumb_bob", description="lens: none, plumb_bob, rational_polynomial, equidistant")
     distortion: tuple[Finite, ...] = Field((), description="its coefficients; those left out are 0")
-    timing: Clock = Field(Timing(rate_hz=60.0), description="when it takes pictures, and what becomes of them")
+    timing: Annotated[Timing, _known(Timing, rate_hz=60.0)] = Field(
+        Timing(rate_hz=60.0), description="when it takes pictures, and what becomes of them"
+    )
     height_m: Positive = Field(PAPER_HEIGHT_M, description="height above the ground, the body being level")
     ahead_m: Finite = Field(0.0, description="how far it sits ahead of the turning point")
     left_m: Finite = Field(0.0, description="how far it sits to the left of the turning point")
@@ -190,7 +198,9 @@ class FrontCamera(CameraSection):
     width_px: Count = Field(640, description="columns of the image")
     height_px: Count = Field(480, description="rows of the image")
     focal_px: Positive = Field(500.0, description="focal length")
-    timing: Clock = Field(Timing(rate_hz=5.0), description="when it takes pictures, and what becomes of them")
+    timing: Annotated[Timing, _known(Timing, rate_hz=5.0)] = Field(
+        Timing(rate_hz=5.0), description="when it takes pictures, and what becomes of them"
+    )
     height_m: Positive = Field(0.6, description="height above the ground, the body being level")
 
 
