@@ -108,7 +108,7 @@ class BoardSettings(_Frozen):
         "or dark corner square",
     )
     detector: Literal["lines", "sectors", "either"] = Field(
-        "lines", description="findChessboardCorners with cornerSubPix, findChessboardCornersSB, or it where that fails"
+        "either", description="findChessboardCorners, findChessboardCornersSB, or that where the first finds nothing"
     )
     sigma_px: Positive = Field(0.1, description="noise of a corner per axis, px")
 
