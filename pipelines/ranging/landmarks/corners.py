@@ -3,20 +3,20 @@
 A corner is where the smaller eigenvalue of the gradients' second moments has a maximum (Shi, Tomasi, "Good features
 to track", CVPR 1994). A track goes on while Lucas-Kanade finds it again, forth and, to within a threshold, back to
 where it was; a corner that another object comes before, or that leaves the image, fails that. Tracks are from frame to
-frame, so that their errors add up slowly: σ grows with the age of a track, not with the size of the motion.
+frame, so that their errors add up with age; a corner begins where a window that grows does not drift (`centred`),
+which makes them several times smaller on the way towards a wall.
 
 OpenCV's corners and tracks were the same, bit for bit, for any number of its threads; nothing is set.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pipelines.ranging.landmarks.frames import NOTHING, Grey, grey_of, ideal_px, is_frame, sighting
 from pipelines.ranging.landmarks.settings import CornerSettings
@@ -26,6 +26,9 @@ from readers.streams import Camera, Sample
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Longs = NDArray[np.int64]
+
+CENTRINGS = 5
+"""Steps to a corner's centre; the last ones change nothing."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,23 +92,17 @@ class TrackedCorners:
         if before is None or before.shape != grey.shape or not len(state.ids):
             return CornerState(grey, next_id=state.next_id)
         s = self.settings
-        size = (s.window_px, s.window_px)
-        first, second = (
-            cv2.buildOpticalFlowPyramid(image, size, s.levels, withDerivatives=True)[1]
-            for image in (evened(before, grey, s.exposure_jump), grey)
-        )
-        points, found, residual = self._lucas_kanade(first, second, state.points_px)
-        back, found_back, _ = self._lucas_kanade(second, first, points)
+        evened_before = evened(before, grey, s.exposure_jump)
+        points, found, residual = self._lucas_kanade(evened_before, grey, state.points_px)
+        back, found_back, _ = self._lucas_kanade(grey, evened_before, points)
         error = np.linalg.norm(back.astype(np.float64) - state.points_px, axis=1)
         good = found & found_back & (error <= s.forward_backward_px) & (residual <= s.max_residual_grey)
         good &= inside(points, grey.shape, s.border_px)
         good[good] = _apart(points[good], 0.5 * s.min_distance_px)
         return CornerState(grey, state.ids[good], points[good], state.age[good] + 1, error[good], state.next_id)
 
-    def _lucas_kanade(
-        self, first: Sequence[Any], second: Sequence[Any], points: Singles
-    ) -> tuple[Singles, NDArray[np.bool_], Floats]:
-        """Where points [n, 2] of one pyramid are in another, whether they were found, and mean grey differences [n]."""
+    def _lucas_kanade(self, first: Grey, second: Grey, points: Singles) -> tuple[Singles, NDArray[np.bool_], Floats]:
+        """Where points [n, 2] of one image are in another, whether they were found, and mean grey differences [n]."""
         s = self.settings
         ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, s.max_iterations, s.tolerance_px)
         moved, status, residual = cv2.calcOpticalFlowPyrLK(
@@ -125,7 +122,7 @@ class TrackedCorners:
     def _replenished(self, state: CornerState) -> CornerState:
         """With new corners, where there are too few tracks."""
         s = self.settings
-        if state.grey is None or len(state.ids) >= s.replenish_below * s.max_corners:
+        if state.grey is None or len(state.ids) >= max(1.0, s.replenish_below * s.max_corners):
             return state
         new = self._corners(state.grey, state.points_px)
         n = len(new)
@@ -146,12 +143,17 @@ class TrackedCorners:
         free[edge : grey.shape[0] - edge, edge : grey.shape[1] - edge] = 255
         for u, v in taken:
             cv2.circle(free, (round(float(u)), round(float(v))), round(s.min_distance_px), 0, -1)
-        textured = cv2.cornerMinEigenVal(grey, s.block_px) >= least_eigenvalue(s.min_texture)
+        textured = cv2.cornerMinEigenVal(grey, s.window_px) >= least_eigenvalue(s.min_texture)
         free[~textured] = 0
-        best = cv2.goodFeaturesToTrack(grey, 0, s.quality, s.min_distance_px, mask=free, blockSize=s.block_px)
+        best = cv2.goodFeaturesToTrack(grey, 0, s.quality, s.min_distance_px, mask=free, blockSize=s.window_px)
         if best is None:
             return np.zeros((0, 2), dtype=np.float32)
-        return _spread(best.reshape(-1, 2), taken, grey.shape, s)
+        best = best.reshape(-1, 2)
+        middle = centred(grey, best, s.window_px)
+        near = np.linalg.norm(middle - best, axis=1) <= 0.5 * s.window_px
+        best = middle[near & inside(middle, grey.shape, s.border_px)]
+        best = best[_apart(best, 0.5 * s.min_distance_px)]
+        return _spread(best, taken, grey.shape, s)
 
 
 def least_eigenvalue(texture: float) -> float:
@@ -160,6 +162,28 @@ def least_eigenvalue(texture: float) -> float:
     λ = (2 g / 255)²: the mean square of central differences over two px, of grey levels from 0 to 1.
     """
     return (2.0 * texture / 255.0) ** 2
+
+
+def centred(grey: Grey, points: Singles, window_px: int) -> Singles:
+    """Points [n, 2] moved to where a window about them can grow without drifting.
+
+    Lucas-Kanade shifts a window until Σ g gᵀ (motion - shift) = 0, g the gradients in it. As the scene comes nearer by
+    a share s, a place q moves by s (q - c) from the point c, so that the shift is 0 where Σ g gᵀ (q - c) = 0: then c
+    stays the same point of the scene. It is the point to which `cornerSubPix` (Förstner, Gülch, 1987) leads, with the
+    equal weights of the tracker's window.
+    """
+    v, u = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(np.float64)
+    gu, gv = (cv2.Scharr(grey, cv2.CV_64F, dx, dy, scale=1 / 32) for dx, dy in ((1, 0), (0, 1)))
+    products = (gu * gu, gu * gv, gv * gv, gu * gu * u + gu * gv * v, gu * gv * u + gv * gv * v)
+    uu, uv, vv, along, down = (cv2.blur(product, (window_px, window_px)) for product in products)
+    moved = points.astype(np.float64)
+    for _ in range(CENTRINGS):
+        columns, rows = np.rint(moved).astype(np.int64).T
+        at = (rows.clip(0, grey.shape[0] - 1), columns.clip(0, grey.shape[1] - 1))
+        a, b, c = uu[at], uv[at], vv[at]
+        det = np.maximum(a * c - b * b, 1e-12)
+        moved = np.column_stack([c * along[at] - b * down[at], a * down[at] - b * along[at]]) / det[:, None]
+    return moved.astype(np.float32)
 
 
 def evened(before: Grey, now: Grey, jump: float) -> Grey:
@@ -181,10 +205,10 @@ def inside(points: Singles, shape: tuple[int, ...], border_px: float) -> NDArray
 
 def _apart(points: Singles, distance_px: float) -> NDArray[np.bool_]:
     """Which points [n, 2] stay when of two that are too close to each other the later one goes."""
-    close = np.linalg.norm(points[:, None].astype(np.float64) - points[None], axis=2) < distance_px
     stay = np.ones(len(points), dtype=bool)
-    for number in range(1, len(points)):
-        stay[number] = not np.any(close[number, :number] & stay[:number])
+    pairs = cKDTree(points).query_pairs(distance_px) if len(points) else ()
+    for first, second in sorted(pairs):
+        stay[second] &= not stay[first]
     return stay
 
 

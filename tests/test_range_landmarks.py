@@ -1,0 +1,327 @@
+"""Landmarks of the range filter: what the sources find is where the scene's truth has it."""
+
+import functools
+import math
+import pickle
+from typing import NamedTuple
+
+import cv2
+import numpy as np
+import pytest
+import scipy.ndimage
+
+from pipelines.lens import pinhole, project, rays
+from pipelines.ranging.landmarks.corners import CornerState, TrackedCorners, least_eigenvalue
+from pipelines.ranging.landmarks.frames import ideal_px, seen_px
+from pipelines.ranging.landmarks.settings import CornerSettings
+from pipelines.ranging.sightings import Sighting
+from pipelines.simulation.motion import FORWARD, Mount, Waypoints
+from pipelines.simulation.render import expose, noise_key_of, view
+from pipelines.simulation.scene import Plane, Scene, chessboard, chessboard_corners, poster, upright
+from pipelines.simulation.surfaces import surface_from_periodic
+from readers.streams import Camera, ImageSample, LandmarkSample, Problem, StreamKind, TrackSample
+
+MOUNT = Mount(np.array([0.0, 0.0, 0.6]), FORWARD)
+CAMERA = pinhole(320, 240, 300.0, distortion=(-0.12, 0.05))
+WALL_M, POSTER_M = 6.0, 3.5  # their x in the world
+POSTER_YZ, POSTER_SIDE = (-0.5, 0.7), 0.5
+
+
+class Eye(NamedTuple):
+    """Where the camera is: world_r_camera [3, 3] and its position [3]."""
+
+    turn: np.ndarray
+    position: np.ndarray
+
+    def in_camera(self, points: np.ndarray) -> np.ndarray:
+        return (points - self.position) @ self.turn
+
+
+def eye_at(x: float, y: float = 0.0, heading: float = 0.0, roll: float = 0.0) -> tuple[Waypoints, Eye]:
+    motion = Waypoints(np.zeros(1), np.array([[x, y, heading]]), roll_rad=roll)
+    turns, positions = MOUNT.world_t_camera(motion.at(np.zeros(1)))
+    return motion, Eye(turns[0], positions[0])
+
+
+def image(grey: np.ndarray, t_ns: int = 0) -> ImageSample:
+    height, width = grey.shape
+    return ImageSample(
+        stream="/cam",
+        t_ns=t_ns,
+        received_ns=t_ns,
+        encoding="mono16" if grey.dtype == np.uint16 else "mono8",
+        payload=grey.tobytes(),
+        width_px=width,
+        height_px=height,
+        step_bytes=width * grey.itemsize,
+    )
+
+
+# ----------------------------------------------------------------------- corners on a wall
+
+
+@functools.cache
+def room() -> Scene:
+    noise = scipy.ndimage.gaussian_filter(np.random.default_rng(1).standard_normal((256, 256)), 2.0, mode="wrap")
+    paint = surface_from_periodic(np.clip(120 + 45 * noise / noise.std(), 0, 255), metres_per_px=0.03)
+    wall = Plane(paint, upright(np.array([WALL_M, 0, 0.6]), math.pi), (-3.8, 3.8, -3.8, 3.8))
+    y, z = POSTER_YZ
+    plate = poster(np.array([POSTER_M, y, z]), size_m=POSTER_SIDE, rng=np.random.default_rng(3))
+    return Scene(None, planes=(wall, plate))
+
+
+def eye_of(frame: int) -> tuple[Waypoints, Eye]:
+    return eye_at(0.05 * frame, 0.15 * math.sin(frame / 6), 0.04 * math.sin(frame / 5))
+
+
+@functools.cache
+def radiant(frame: int) -> np.ndarray:
+    return view(room(), CAMERA, MOUNT, eye_of(frame)[0], 0.0)
+
+
+def shot(frame: int, gain: float = 1.0) -> ImageSample:
+    return image(expose(radiant(frame), noise_key=noise_key_of(0, frame), noise_grey=2.0, gain=gain))
+
+
+def places(points_px: np.ndarray, eye: Eye) -> tuple[np.ndarray, np.ndarray]:
+    """Where in the world image points lie [n, 3], and which of them are on the poster [n]."""
+    flat = (points_px - CAMERA.matrix[:2, 2]) / CAMERA.matrix[0, 0]
+    directions = np.column_stack([flat, np.ones(len(flat))]) @ eye.turn.T
+
+    def hit(x: float) -> np.ndarray:
+        return eye.position + (x - eye.position[0]) / directions[:, :1] * directions
+
+    wall, plate = hit(WALL_M), hit(POSTER_M)
+    on_plate = np.all(np.abs(plate[:, 1:] - POSTER_YZ) < POSTER_SIDE / 2, axis=1)
+    return np.where(on_plate[:, None], plate, wall), on_plate
+
+
+def ideal_of(eye: Eye, points: np.ndarray) -> np.ndarray:
+    inside = eye.in_camera(points)
+    return inside[:, :2] / inside[:, 2:] * CAMERA.matrix[0, 0] + CAMERA.matrix[:2, 2]
+
+
+class Followed(NamedTuple):
+    """Every point of every track: its number, age in frames, error in px [n, 2], whether it is on the poster."""
+
+    ids: np.ndarray
+    age: np.ndarray
+    error: np.ndarray
+    on_plate: np.ndarray
+    sigma: np.ndarray
+
+
+def follow(settings: CornerSettings, frames: int = 40, gains: np.ndarray | None = None) -> Followed:
+    source = TrackedCorners(CAMERA, settings)
+    state, born, rows = source.start(), {}, []
+    for frame in range(frames):
+        state, seen = source.sight(state, shot(frame, 1.0 if gains is None else float(gains[frame])))
+        assert seen is not None
+        eye = eye_of(frame)[1]
+        points, on_plate = places(seen.points_px, eye)
+        for number, point, plate in zip(seen.ids.tolist(), points, on_plate, strict=True):
+            born.setdefault(number, (frame, point, plate))
+        truth = ideal_of(eye, np.array([born[n][1] for n in seen.ids.tolist()]))
+        for number, error, sigma in zip(seen.ids.tolist(), seen.points_px - truth, seen.sigma_px, strict=True):
+            rows.append((number, frame - born[number][0], *error, born[number][2], sigma))
+    table = np.array(rows)
+    return Followed(table[:, 0].astype(int), table[:, 1], table[:, 2:4], table[:, 4] > 0, table[:, 5])
+
+
+def rms(errors: np.ndarray) -> float:
+    return float(np.sqrt((errors**2).mean()))
+
+
+@functools.cache
+def usual() -> Followed:
+    return follow(CornerSettings(max_corners=100))
+
+
+def test_tracks_stay_on_their_points_of_the_wall() -> None:
+    track = usual()
+    far = np.linalg.norm(track.error, axis=1)
+    assert np.mean(far > 2) < 0.03  # they sit on the poster's edge, half on the wall
+    for youngest, oldest, limit in ((1, 2, 0.1), (2, 10, 0.2), (10, 20, 0.3), (20, 40, 0.5)):
+        chosen = (track.age >= youngest) & (track.age < oldest) & (far <= 2)
+        assert chosen.sum() > 100
+        assert rms(track.error[chosen]) < limit
+    assert np.median(far[(track.age >= 10) & (track.age < 20)]) < 0.15
+
+
+def test_numbers_rise_and_are_never_used_again() -> None:
+    track = usual()
+    begun = track.ids[track.age == 0]
+    assert np.all(np.diff(begun) > 0)  # hence each begins once
+    for number in np.unique(track.ids):
+        ages = track.age[track.ids == number]
+        np.testing.assert_array_equal(ages, np.arange(len(ages)))  # no track comes back
+
+
+def test_corners_are_spread_and_replenished() -> None:
+    source = TrackedCorners(CAMERA, CornerSettings(max_corners=96))
+    state = source.start()
+    for frame in range(0, 40, 4):
+        state, seen = source.sight(state, shot(frame))
+        assert seen is not None
+        assert 0.7 * 96 <= len(seen.ids) <= 96
+        assert len(set(seen.ids.tolist())) == len(seen.ids)
+        pairs = np.linalg.norm(state.points_px[:, None] - state.points_px[None], axis=2)[
+            np.triu_indices(len(seen.ids), 1)
+        ]
+        assert pairs.min() >= 6
+        assert np.all((state.points_px >= 12) & (state.points_px <= np.array([319, 239]) - 12))
+        if frame == 0:
+            columns, rows = (state.points_px // [40, 40]).astype(int).T
+            assert np.bincount(8 * rows + columns, minlength=48).max() <= 4  # 96 tracks in 48 cells
+
+
+def test_a_corner_that_something_comes_before_is_lost() -> None:
+    """A plate slides sideways before the wall; what it hides must not be tracked on."""
+
+    def sight_of(y: float) -> np.ndarray:
+        plate = poster(np.array([POSTER_M, y, 0.6]), size_m=1.2, rng=np.random.default_rng(3))
+        return view(Scene(None, planes=(room().planes[0], plate)), CAMERA, MOUNT, eye_at(0.0)[0], 0.0)
+
+    places_y = np.linspace(1.6, 0.9, 8)  # of the plate's centre: it comes in from the left, 8.6 px a frame
+    frames = [expose(sight_of(y), noise_key=noise_key_of(5, k), noise_grey=2.0) for k, y in enumerate(places_y)]
+    kept = {}
+    for distance in (0.3, 1e3):
+        settings = CornerSettings(
+            max_corners=400, min_distance_px=7, replenish_below=0, forward_backward_px=distance, max_residual_grey=255
+        )
+        source = TrackedCorners(CAMERA, settings)
+        state, start = source.sight(source.start(), image(frames[0]))
+        assert start is not None
+        for frame in frames[1:]:
+            state, seen = source.sight(state, image(frame))
+            assert seen is not None
+        # the plate's right edge as a shadow on the wall, where it was and where it is
+        first, last = ((y - 0.6) * WALL_M / POSTER_M for y in places_y[[0, -1]])
+        wall = places(start.points_px, eye_at(0.0)[1])[0]
+        level = np.abs(wall[:, 2] - 0.6) < 0.8
+        hidden = level & (wall[:, 1] < first - 0.2) & (wall[:, 1] > last + 0.2)
+        clear = wall[:, 1] < last - 0.4
+        assert hidden.sum() > 20
+        assert clear.sum() > 100
+        moved = ideal_px(CAMERA, state.points_px)[np.searchsorted(state.ids, start.ids).clip(max=len(state.ids) - 1)]
+        stayed = np.isin(start.ids, seen.ids) & (np.linalg.norm(moved - start.points_px, axis=1) < 3)
+        kept[distance] = float(stayed[hidden].mean()), float(np.isin(start.ids, seen.ids)[hidden].mean())
+        assert stayed[clear].mean() > 0.95
+    print(kept)
+    assert kept[0.3][1] < 0.1 < kept[1e3][1]
+
+
+def test_a_change_of_exposure_does_not_end_the_tracks() -> None:
+    gains = np.where(np.arange(8) % 2, 1.2, 0.9)
+    even = follow(CornerSettings(max_corners=100), 8, gains)
+    raw = follow(CornerSettings(max_corners=100, exposure_jump=math.inf), 8, gains)
+    assert (even.age == 7).sum() > 80
+    assert (raw.age == 7).sum() < 20
+    assert np.median(np.linalg.norm(even.error[even.age == 7], axis=1)) < 0.1
+
+
+def test_the_noise_of_a_point_can_follow_its_residual() -> None:
+    track = follow(CornerSettings(max_corners=60, sigma_px=0.25, sigma_from="residual"), 4)
+    assert np.all(track.sigma[track.age == 0] == 0.25)
+    later = track.sigma[track.age > 0]
+    assert np.all((later > 0.25) & (later <= math.hypot(0.25, 0.3)))
+    assert np.all(usual().sigma == 0.5)
+
+
+BLANK = np.full((240, 320), 128, dtype=np.uint8)
+
+
+def broken(kind: StreamKind = StreamKind.IMAGE) -> Problem:
+    return Problem(stream="/cam", t_ns=0, received_ns=0, kind=kind, reason="torn")
+
+
+@pytest.mark.parametrize(
+    "bad", [image(BLANK), image(np.zeros((120, 160), np.uint8)), broken()], ids=["blank", "size", "torn"]
+)
+def test_a_bad_frame_ends_the_tracks(bad: ImageSample | Problem) -> None:
+    source = TrackedCorners(CAMERA, CornerSettings(max_corners=50))
+    state, first = source.sight(source.start(), shot(0))
+    state, none = source.sight(state, bad)
+    assert first is not None
+    assert none is not None
+    assert len(first.ids) == 50
+    assert len(none.ids) == 0
+    state, again = source.sight(state, shot(1))
+    assert again is not None
+    assert len(again.ids) == 50
+    assert again.ids.min() == 50
+    assert np.all(state.age == 0)
+
+
+def test_what_is_no_frame_is_passed_over() -> None:
+    source = TrackedCorners(CAMERA)
+    state, _ = source.sight(source.start(), shot(0))
+    same, nothing = source.sight(state, broken(StreamKind.IMU))
+    assert nothing is None
+    assert same is state
+
+
+def test_noise_alone_has_no_corners() -> None:
+    noisy = expose(np.full((240, 320), 120, np.float32), noise_key=3, noise_grey=3.0)
+    _, seen = TrackedCorners(CAMERA).sight(CornerState(), image(noisy))
+    assert seen is not None
+    assert len(seen.ids) == 0
+
+
+def test_the_texture_limit_is_in_grey_levels_per_px() -> None:
+    v, u = np.mgrid[:60, :60]
+    w = 2 * np.pi / 59
+    wave = 120 + 60 * np.sin(w * u) * np.cos(w * v)
+    slope = 60 * w / 2  # rms over a period, along either axis
+    eigenvalue = cv2.cornerMinEigenVal(np.rint(wave).astype(np.uint8), 59)[30, 30]
+    assert eigenvalue == pytest.approx(least_eigenvalue(slope), rel=0.1)
+
+
+def bits(state: CornerState) -> tuple[bytes, ...]:
+    return tuple(np.asarray(a).tobytes() for a in (state.ids, state.points_px, state.age, state.error_px))
+
+
+def test_the_tracks_go_on_from_a_state_with_the_same_bytes() -> None:
+    source = TrackedCorners(CAMERA, CornerSettings(max_corners=80))
+    threads = cv2.getNumThreads()
+    runs = []
+    try:
+        for number in (1, threads, 4):
+            cv2.setNumThreads(number)
+            states = [source.start()]
+            for frame in range(6):
+                states.append(source.sight(states[-1], shot(frame))[0])
+            runs.append(states)
+    finally:
+        cv2.setNumThreads(threads)
+    assert [bits(s) for s in runs[0]] == [bits(s) for s in runs[1]] == [bits(s) for s in runs[2]]
+    restored = pickle.loads(pickle.dumps(runs[0][3]))
+    for frame in (3, 4, 5):
+        restored, _ = source.sight(restored, shot(frame))
+    assert bits(restored) == bits(runs[0][-1])
+
+
+def test_a_window_that_grows_keeps_its_centre() -> None:
+    """The tracked point of an image and of its copy that is 4 % larger about any point is the same point."""
+    grey = expose(radiant(0), noise_key=0)
+    source = TrackedCorners(CAMERA, CornerSettings(max_corners=60))
+    state, _ = source.sight(source.start(), image(grey))
+    larger = np.array([[1.04, 0, -0.04 * 160], [0, 1.04, -0.04 * 120]])
+    warped = cv2.warpAffine(grey, larger, (320, 240), flags=cv2.INTER_CUBIC)
+    after, _ = source.sight(state, image(warped))
+    both, first, second = np.intersect1d(state.ids, after.ids, return_indices=True)
+    expected = state.points_px[first] @ larger[:, :2].T + larger[:, 2]
+    assert len(both) > 30
+    assert np.median(np.linalg.norm(after.points_px[second] - expected, axis=1)) < 0.06
+
+
+def test_points_are_freed_of_the_distortion_and_back() -> None:
+    pixels = np.array([[20.0, 15], [160, 120], [300, 200]])
+    ideal = ideal_px(CAMERA, pixels)
+    flat = rays(CAMERA, pixels)
+    np.testing.assert_allclose(ideal, flat[:, :2] * 300 + [159.5, 119.5], atol=1e-9)
+    np.testing.assert_allclose(seen_px(CAMERA, ideal), pixels, atol=1e-9)
+    assert np.linalg.norm(ideal - pixels, axis=1)[0] > 5
+    folding = pinhole(600, 10, 400.0, distortion=(-0.3,))
+    reached = ideal_px(folding, np.array([[299.5, 4.5], [299.5 + 0.71 * 400, 4.5], [np.nan, 0]]))
+    assert np.isfinite(reached[:, 0]).tolist() == [True, False, False]
