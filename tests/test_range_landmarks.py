@@ -3,25 +3,57 @@
 import functools
 import math
 import pickle
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
 import pytest
 import scipy.ndimage
+from pydantic import ValidationError
+from recordings_dir import RECORDINGS
+from scipy.spatial.transform import Rotation
 
 from pipelines.lens import pinhole, project, rays
+from pipelines.ranging import reference
+from pipelines.ranging.landmarks.boards import (
+    BoardState,
+    Chessboard,
+    Markers,
+    board_pose,
+    chessboard_points,
+    marker_points,
+)
 from pipelines.ranging.landmarks.corners import CornerState, TrackedCorners, least_eigenvalue
 from pipelines.ranging.landmarks.frames import ideal_px, seen_px
-from pipelines.ranging.landmarks.settings import CornerSettings
+from pipelines.ranging.landmarks.recorded import RecordedBearings, RecordedTracks, bearing_camera
+from pipelines.ranging.landmarks.settings import (
+    BearingSettings,
+    BoardSettings,
+    CornerSettings,
+    LandmarkKind,
+    LandmarkSettings,
+    MarkerSettings,
+)
+from pipelines.ranging.landmarks.sources import source_of
+from pipelines.ranging.reference import PoseTrack, ReferenceRanges
 from pipelines.ranging.sightings import Sighting
 from pipelines.simulation.motion import FORWARD, Mount, Waypoints
 from pipelines.simulation.render import expose, noise_key_of, view
 from pipelines.simulation.scene import Plane, Scene, chessboard, chessboard_corners, poster, upright
 from pipelines.simulation.surfaces import surface_from_periodic
-from readers.streams import Camera, ImageSample, LandmarkSample, Problem, StreamKind, TrackSample
+from readers.streams import (
+    Camera,
+    ImageSample,
+    Landmark,
+    LandmarkSample,
+    PoseSample,
+    Problem,
+    Sample,
+    StreamKind,
+    TrackSample,
+)
 
-MOUNT = Mount(np.array([0.0, 0.0, 0.6]), FORWARD)
+MOUNT = Mount(np.zeros(3), FORWARD)
 CAMERA = pinhole(320, 240, 300.0, distortion=(-0.12, 0.05))
 WALL_M, POSTER_M = 6.0, 3.5  # their x in the world
 POSTER_YZ, POSTER_SIDE = (-0.5, 0.7), 0.5
@@ -38,7 +70,7 @@ class Eye(NamedTuple):
 
 
 def eye_at(x: float, y: float = 0.0, heading: float = 0.0, roll: float = 0.0) -> tuple[Waypoints, Eye]:
-    motion = Waypoints(np.zeros(1), np.array([[x, y, heading]]), roll_rad=roll)
+    motion = Waypoints(np.zeros(1), np.array([[x, y, heading]]), height_m=0.6, roll_rad=roll)
     turns, positions = MOUNT.world_t_camera(motion.at(np.zeros(1)))
     return motion, Eye(turns[0], positions[0])
 
@@ -182,7 +214,7 @@ def test_a_corner_that_something_comes_before_is_lost() -> None:
         plate = poster(np.array([POSTER_M, y, 0.6]), size_m=1.2, rng=np.random.default_rng(3))
         return view(Scene(None, planes=(room().planes[0], plate)), CAMERA, MOUNT, eye_at(0.0)[0], 0.0)
 
-    places_y = np.linspace(1.6, 0.9, 8)  # of the plate's centre: it comes in from the left, 8.6 px a frame
+    places_y = np.linspace(1.8, 0.5, 12)  # of the plate's centre: it comes in from the left, 10 px a frame
     frames = [expose(sight_of(y), noise_key=noise_key_of(5, k), noise_grey=2.0) for k, y in enumerate(places_y)]
     kept = {}
     for distance in (0.3, 1e3):
@@ -202,13 +234,12 @@ def test_a_corner_that_something_comes_before_is_lost() -> None:
         hidden = level & (wall[:, 1] < first - 0.2) & (wall[:, 1] > last + 0.2)
         clear = wall[:, 1] < last - 0.4
         assert hidden.sum() > 20
-        assert clear.sum() > 100
-        moved = ideal_px(CAMERA, state.points_px)[np.searchsorted(state.ids, start.ids).clip(max=len(state.ids) - 1)]
-        stayed = np.isin(start.ids, seen.ids) & (np.linalg.norm(moved - start.points_px, axis=1) < 3)
-        kept[distance] = float(stayed[hidden].mean()), float(np.isin(start.ids, seen.ids)[hidden].mean())
+        assert clear.sum() > 50
+        stayed = np.isin(start.ids, seen.ids)
         assert stayed[clear].mean() > 0.95
-    print(kept)
-    assert kept[0.3][1] < 0.1 < kept[1e3][1]
+        kept[distance] = stayed[hidden].mean()
+    assert kept[0.3] < 0.05  # no other check finds them: they slide along with the edge
+    assert kept[1e3] > 0.3
 
 
 def test_a_change_of_exposure_does_not_end_the_tracks() -> None:
@@ -325,3 +356,159 @@ def test_points_are_freed_of_the_distortion_and_back() -> None:
     folding = pinhole(600, 10, 400.0, distortion=(-0.3,))
     reached = ideal_px(folding, np.array([[299.5, 4.5], [299.5 + 0.71 * 400, 4.5], [np.nan, 0]]))
     assert np.isfinite(reached[:, 0]).tolist() == [True, False, False]
+
+
+# ---------------------------------------------------------------------------- chessboards
+
+BOARD_M = 5.0
+WIDE = pinhole(480, 360, 450.0, distortion=(-0.12, 0.05))
+
+
+def board_view(
+    columns: int, rows: int, square_m: float, eye: tuple[Waypoints, Eye], facing: float = math.pi, noise: float = 2.0
+) -> tuple[ImageSample, np.ndarray]:
+    """A frame of a chessboard, and its corners [n, 3] in camera axes, row by row from its upper left."""
+    pose = upright(np.array([BOARD_M, 0, 0.6]), facing)
+    scene = Scene(None, planes=(chessboard(columns, rows, square_m, pose),))
+    grey = expose(view(scene, WIDE, MOUNT, eye[0], 0.0), noise_key=noise_key_of(7, 0), noise_grey=noise)
+    return image(grey), eye[1].in_camera(chessboard_corners(columns, rows, square_m, pose))
+
+
+def shown(inside: np.ndarray) -> np.ndarray:
+    return inside[:, :2] / inside[:, 2:] * 450 + WIDE.matrix[:2, 2]
+
+
+def seen_by(source: Any, state: Any, sample: Sample) -> tuple[Any, Sighting]:
+    state, seen = source.sight(state, sample)
+    assert seen is not None
+    return state, seen
+
+
+def test_corners_and_depths_of_a_board_on_the_way_towards_it() -> None:
+    settings = BoardSettings(columns=9, rows=6, square_m=0.06, landmarks="all")
+    source, points = Chessboard(WIDE, settings), chessboard_points(settings)
+    state, off, wrong = source.start(), [], []
+    for x in (0.0, 1.0, 2.0, 3.0, 3.6):  # squares of 5 to 19 px
+        sample, inside = board_view(9, 6, 0.06, eye_at(x, 0.2, 0.04))
+        state, seen = seen_by(source, state, sample)
+        assert seen.ids.tolist() == list(range(54))
+        off.append(np.linalg.norm(seen.points_px - shown(inside), axis=1).mean())
+        pose = board_pose(seen.points_px, points, WIDE)
+        assert pose is not None
+        wrong.append(np.abs(pose.in_camera(points)[:, 2] / inside[:, 2] - 1).max())
+        assert pose.rms_px < 0.1
+        assert np.all(seen.sigma_px == 0.1)
+    assert max(off) < 0.1
+    assert max(wrong) < 0.01
+    assert max(wrong[2:]) < 0.003
+
+
+def test_numbers_stay_while_the_board_leaves_and_comes_back() -> None:
+    source = Chessboard(WIDE, BoardSettings(square_m=0.06, landmarks="all"))
+    state = source.start()
+    for y, roll in ((0.0, 0.0), (3.0, 0.0), (0.3, 0.0), (0.0, 3.0), (0.0, -1.5)):
+        sample, inside = board_view(9, 6, 0.06, eye_at(3.0, y, 0.0, roll))
+        before = state
+        state, seen = seen_by(source, state, sample)
+        if y == 3.0:
+            assert len(seen.ids) == 0
+            assert state == before
+        else:
+            assert np.linalg.norm(seen.points_px - shown(inside), axis=1).mean() < 0.1
+    assert state.light == 1
+
+
+def test_the_first_corner_is_at_the_upper_left_or_by_its_colour() -> None:
+    upside_down = eye_at(3.0, 0.0, 0.0, math.pi)
+    sample, inside = board_view(9, 6, 0.06, upside_down)
+    truth = shown(inside)
+    for first, expected in (("upper-left", 53), ("light", 0), ("dark", 53)):
+        source = Chessboard(WIDE, BoardSettings(landmarks=(0,), first=first))
+        _, seen = seen_by(source, source.start(), sample)
+        assert seen.ids.tolist() == [0]
+        np.testing.assert_allclose(seen.points_px[0], truth[expected], atol=0.2)
+
+
+@pytest.mark.parametrize(("columns", "rows"), [(7, 7), (8, 6), (7, 5), (5, 8)])
+def test_a_board_that_looks_the_same_from_both_ends_is_followed(columns: int, rows: int) -> None:
+    source = Chessboard(WIDE, BoardSettings(columns=columns, rows=rows, landmarks="all"))
+    state = source.start()
+    for roll in (0.0, 0.6, 1.2, 1.8, 2.4, 3.0):
+        sample, inside = board_view(columns, rows, 0.06, eye_at(3.0, 0.0, 0.0, roll))
+        state, seen = seen_by(source, state, sample)
+        assert np.linalg.norm(seen.points_px - shown(inside), axis=1).mean() < 0.1
+
+
+def test_the_landmarks_of_a_board_are_chosen() -> None:
+    assert BoardSettings(columns=4, rows=3).numbers == (0, 3, 8, 11)
+    assert BoardSettings(columns=4, rows=3, landmarks="all").numbers == tuple(range(12))
+    assert BoardSettings(columns=4, rows=3, landmarks=(5, 2)).numbers == (5, 2)
+    sample, inside = board_view(9, 6, 0.06, eye_at(3.0))
+    source = Chessboard(WIDE, BoardSettings(landmarks=(10, 4)))
+    _, seen = seen_by(source, source.start(), sample)
+    assert seen.ids.tolist() == [10, 4]
+    np.testing.assert_allclose(seen.points_px, shown(inside)[[10, 4]], atol=0.2)
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        ({"landmarks": (54,)}, "0 to 53"),
+        ({"landmarks": (1, 1)}, "named twice"),
+        ({"rows": 7, "first": "light"}, "do not tell its ends apart"),
+        ({"colums": 3}, "colums"),
+    ],
+)
+def test_settings_of_boards_that_cannot_be_are_refused(change: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValidationError, match=words):
+        BoardSettings(**change)
+
+
+@pytest.mark.parametrize("bad", [BLANK, np.zeros((90, 120), np.uint8), None], ids=["blank", "size", "torn"])
+@pytest.mark.parametrize("source", [Chessboard(WIDE), Markers(WIDE)], ids=["chessboard", "markers"])
+def test_a_frame_without_a_board_has_no_landmarks(source: Any, bad: np.ndarray | None) -> None:
+    if bad is BLANK:
+        bad = np.full((360, 480), 128, np.uint8)
+    state, seen = seen_by(source, source.start(), broken() if bad is None else image(bad))
+    assert len(seen.ids) == 0
+    assert state == source.start()
+
+
+def test_images_of_sixteen_bits_are_as_good() -> None:
+    sample, inside = board_view(9, 6, 0.06, eye_at(3.0))
+    deep = sample.grey().astype(np.uint16) << 4  # a camera of 12 bits
+    source = Chessboard(WIDE, BoardSettings(landmarks="all"))
+    _, seen = seen_by(source, source.start(), image(deep))
+    assert np.linalg.norm(seen.points_px - shown(inside), axis=1).mean() < 0.1
+
+
+def test_the_pose_of_a_tilted_board_is_the_right_one_of_two() -> None:
+    settings = BoardSettings(columns=9, rows=6, square_m=0.06)
+    points = chessboard_points(settings)
+    rng = np.random.default_rng(2)
+    for tilt in (0.2, 0.5, 0.9):
+        truth = np.eye(4)
+        truth[:3, :3] = Rotation.from_euler("xyz", [tilt, -0.7 * tilt, 0.3]).as_matrix()
+        truth[:3, 3] = [-0.3, 0.1, 2.0]
+        pixels = shown(points @ truth[:3, :3].T + truth[:3, 3])
+        exact = board_pose(pixels, points, WIDE)
+        assert exact is not None
+        np.testing.assert_allclose(exact.camera_t_board, truth, atol=1e-6)
+        assert exact.rms_px < 1e-6
+        noisy = board_pose(pixels + 0.1 * rng.standard_normal(pixels.shape), points, WIDE)
+        assert noisy is not None
+        assert noisy.rms_px == pytest.approx(0.1 * math.sqrt(2), rel=0.2)
+        assert not noisy.other_rms_px < 3 * noisy.rms_px
+    with pytest.raises(ValueError, match="at least 4"):
+        board_pose(pixels[:3], points[:3], WIDE)
+    line = points[:5]
+    assert board_pose(shown(line + [0, 0, 2.0]), line, WIDE) is None
+
+
+def test_a_small_board_far_away_has_a_second_pose() -> None:
+    points = chessboard_points(BoardSettings(columns=3, rows=3, square_m=0.02))
+    turn = Rotation.from_euler("x", 0.3).as_matrix()
+    pixels = shown(points @ turn.T + [0, 0, 3.0]) + 0.1 * np.random.default_rng(1).standard_normal((9, 2))
+    pose = board_pose(pixels, points, WIDE)
+    assert pose is not None
+    assert pose.rms_px <= pose.other_rms_px < 1.2 * pose.rms_px
