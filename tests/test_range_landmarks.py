@@ -1,5 +1,6 @@
 """Landmarks of the range filter: what the sources find is where the scene's truth has it."""
 
+import dataclasses
 import functools
 import math
 import pickle
@@ -16,7 +17,6 @@ from scipy.spatial.transform import Rotation
 from pipelines.lens import pinhole, project, rays
 from pipelines.ranging import reference
 from pipelines.ranging.landmarks.boards import (
-    BoardState,
     Chessboard,
     Markers,
     board_pose,
@@ -512,3 +512,346 @@ def test_a_small_board_far_away_has_a_second_pose() -> None:
     pose = board_pose(pixels, points, WIDE)
     assert pose is not None
     assert pose.rms_px <= pose.other_rms_px < 1.2 * pose.rms_px
+
+
+# --------------------------------------------------------------------------------- markers
+
+MARKER_PX = 96  # of a printed marker's black square; a quarter of that is its margin
+
+
+def printed_markers(settings: MarkerSettings, facing: float = math.pi) -> tuple[Plane, np.ndarray, np.ndarray]:
+    """A board of markers with a light margin, its corners' numbers [n] and places in the world [n, 3]."""
+    assert settings.marker_m is not None
+    name = f"DICT_{settings.dictionary.upper()}"
+    dictionary = cv2.aruco.getPredefinedDictionary(getattr(cv2.aruco, name))
+    gap = round(MARKER_PX * settings.gap_m / settings.marker_m)
+    pitch, margin = MARKER_PX + gap, MARKER_PX // 4
+    picture = np.full((settings.rows * pitch - gap, settings.columns * pitch - gap), 225.0)
+    for number in range(settings.columns * settings.rows):
+        v, u = pitch * (number // settings.columns), pitch * (number % settings.columns)
+        code = cv2.aruco.generateImageMarker(dictionary, settings.first_tag + number, MARKER_PX)
+        picture[v : v + MARKER_PX, u : u + MARKER_PX] = np.where(code > 0, 225.0, 25.0)
+    height, width = picture.shape
+    soft = scipy.ndimage.gaussian_filter(np.pad(picture, margin, constant_values=225.0), 0.7)
+    texel = settings.marker_m / MARKER_PX
+    pose = upright(np.array([BOARD_M, 0, 0.6]), facing)
+    first = np.eye(4)  # the plane's origin is the middle of the picture's first px
+    first[:2, 3] = texel * np.array([0.5 - width / 2 - margin, height / 2 + margin - 0.5])
+    bounds = (-0.5 * texel, (width + 2 * margin - 0.5) * texel, -(height + 2 * margin - 0.5) * texel, 0.5 * texel)
+    plane = Plane(surface_from_periodic(soft, metres_per_px=texel), pose @ first, bounds)
+    corners = marker_points(settings)
+    ids = np.concatenate([4 * tag + np.arange(4) for tag in corners])
+    flat = np.concatenate(list(corners.values())) - texel * np.array([width / 2, height / 2, 0])
+    return plane, ids, (flat * [1, -1, 1]) @ pose[:3, :3].T + pose[:3, 3]
+
+
+@pytest.mark.parametrize(
+    "change",
+    [
+        {"marker_m": 0.4},
+        {"marker_m": 0.2, "columns": 3, "rows": 2, "gap_m": 0.05, "first_tag": 7},
+        {"marker_m": 0.3, "dictionary": "apriltag_36h11", "columns": 2, "gap_m": 0.1, "first_tag": 3},
+    ],
+    ids=["one", "board", "apriltag"],
+)
+def test_corners_and_depths_of_markers(change: dict[str, Any]) -> None:
+    settings = MarkerSettings(**change)
+    plane, ids, places_m = printed_markers(settings)
+    source = Markers(WIDE, settings)
+    for x, roll in ((2.0, 0.0), (3.0, 0.4)):
+        motion, eye = eye_at(x, 0.1, 0.03, roll)
+        grey = expose(view(Scene(None, planes=(plane,)), WIDE, MOUNT, motion, 0.0), noise_key=1, noise_grey=2.0)
+        _, seen = seen_by(source, source.start(), image(grey))
+        np.testing.assert_array_equal(seen.ids, ids)
+        inside = eye.in_camera(places_m)
+        off = np.linalg.norm(seen.points_px - shown(inside), axis=1)
+        assert off.mean() < 0.15
+        found = reference.of_markers(seen, settings, WIDE)
+        print(x, off.mean(), off.max(), np.abs(found.depth_m / inside[:, 2] - 1).max())
+        np.testing.assert_allclose(found.depth_m, inside[:, 2], rtol=0.01)
+        np.testing.assert_allclose(found.distance_m, np.linalg.norm(inside, axis=1), rtol=0.01)
+        assert np.all(seen.sigma_px == 0.1)
+        again = source.sight(None, image(grey))[1]
+        assert again is not None
+        assert again.points_px.tobytes() == seen.points_px.tobytes()
+
+
+def test_tags_are_chosen_and_those_seen_twice_left_out() -> None:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_4X4_50)
+    grey = np.full((360, 480), 230, np.uint8)
+    for tag, u, v in ((1, 40, 60), (2, 200, 60), (3, 340, 60), (2, 60, 220)):
+        grey[v : v + 80, u : u + 80] = cv2.aruco.generateImageMarker(dictionary, tag, 80)
+    _, seen = seen_by(Markers(WIDE), None, image(grey))
+    assert sorted(set((seen.ids // 4).tolist())) == [1, 3]
+    _, seen = seen_by(Markers(WIDE, MarkerSettings(tags=(3, 9))), None, image(grey))
+    assert seen.ids.tolist() == [12, 13, 14, 15]
+    plain = Markers(pinhole(480, 360, 450.0), MarkerSettings(tags=(3,)))
+    _, seen = seen_by(plain, None, image(grey))  # clockwise from the upper left
+    np.testing.assert_allclose(seen.points_px, np.array([[340, 60], [420, 60], [420, 140], [340, 140]]) - 0.5, atol=0.7)
+
+
+def test_markers_that_cannot_be_are_refused() -> None:
+    with pytest.raises(ValidationError, match="apriltag_36h11"):
+        MarkerSettings(dictionary="5x4_20")
+    with pytest.raises(ValueError, match="0 to 49, not 50"):
+        Markers(WIDE, MarkerSettings(columns=51))
+    with pytest.raises(ValueError, match="marker_m is unknown"):
+        marker_points(MarkerSettings())
+    with pytest.raises(ValueError, match="square_m is unknown"):
+        chessboard_points(BoardSettings())
+
+
+# -------------------------------------------------------------------- what was recorded
+
+
+def test_recorded_tracks_are_freed_of_distortion() -> None:
+    inside = np.array([[0.5, 0.2, 2.0], [-0.4, -0.3, 1.5], [0.1, 0, 3]])
+    pixels = np.vstack([project(CAMERA, inside), [[np.nan, 3]], [[1.0, 1.0]]])
+    sample = TrackSample(stream="t", t_ns=0, received_ns=0, ids=np.array([9, 2, 5, 7, 2]), points_px=pixels)
+    source = RecordedTracks(CAMERA)
+    _, seen = seen_by(source, None, sample)
+    assert seen.ids.tolist() == [2, 5, 9]
+    truth = inside[:, :2] / inside[:, 2:] * 300 + CAMERA.matrix[:2, 2]
+    np.testing.assert_allclose(seen.points_px, truth[[1, 2, 0]], atol=1e-9)
+    assert seen.sigma_px.tolist() == [0.5] * 3
+    assert source.sight(None, image(BLANK)) == (None, None)
+    assert len(seen_by(source, None, broken(StreamKind.TRACK))[1].ids) == 0
+    blind = pinhole(10, 10, 5.0)
+    with pytest.raises(ValueError, match="no calibration"):
+        RecordedTracks(dataclasses.replace(blind, matrix=np.full((3, 3), np.nan)))
+
+
+def test_bearings_are_points_of_a_camera_that_looks_ahead() -> None:
+    settings = BearingSettings(focal_px=400.0, sigma_rad=0.01)
+    bearing = np.array([0.3, -0.5, np.radians(81), np.nan, 0.0, 0.1])
+    sample = LandmarkSample(
+        stream="l",
+        t_ns=0,
+        received_ns=0,
+        ids=np.array([8, 6, 9, 10, 3, 8]),
+        range_m=np.full(6, 2.0),
+        bearing_rad=bearing,
+    )
+    _, seen = seen_by(RecordedBearings(settings), None, sample)
+    assert seen.ids.tolist() == [3, 6, 8]
+    expected = np.array([0.0, -0.5, 0.3])
+    in_body = np.column_stack([np.cos(expected), np.sin(expected), np.zeros(3)])
+    camera = bearing_camera(settings)
+    in_cam = in_body @ camera.body_t_camera[:3, :3]
+    np.testing.assert_allclose(seen.points_px, project(camera, in_cam), atol=1e-9)
+    shift = (400 * np.tan(expected + 1e-6) - 400 * np.tan(expected)) / 1e-6
+    np.testing.assert_allclose(seen.sigma_px, 0.01 * shift, rtol=1e-4)
+    _, few = seen_by(RecordedBearings(settings, only={8}), None, sample)
+    assert few.ids.tolist() == [8]
+    assert len(seen_by(RecordedBearings(), None, broken(StreamKind.LANDMARKS))[1].ids) == 0
+
+
+# ---------------------------------------------------------------------------------- factory
+
+TRACKS = TrackSample(stream="t", t_ns=0, received_ns=0, ids=np.array([1]), points_px=np.array([[5.0, 6]]))
+BEARINGS = LandmarkSample(
+    stream="l", t_ns=0, received_ns=0, ids=np.array([4]), range_m=np.array([2.0]), bearing_rad=np.array([0.1])
+)
+
+
+@pytest.mark.parametrize(
+    ("kind", "expected"),
+    [
+        ("tracks", RecordedTracks),
+        ("bearings", RecordedBearings),
+        ("corners", TrackedCorners),
+        ("chessboard", Chessboard),
+        ("aruco", Markers),
+    ],
+)
+def test_a_source_by_its_name(kind: str, expected: type) -> None:
+    settings = LandmarkSettings(landmarks=LandmarkKind(kind), corners=CornerSettings(max_corners=7))
+    source = source_of(settings, CAMERA)
+    assert type(source) is expected
+    if kind == "corners":
+        assert len(seen_by(source, source.start(), shot(0))[1].ids) == 7
+    if kind != "bearings":
+        with pytest.raises(ValueError, match="calibrated camera"):
+            source_of(settings, None)
+
+
+def test_the_first_frame_chooses_the_source() -> None:
+    source = source_of(LandmarkSettings(), CAMERA, surveyed={4})
+    for first, other, expected in ((TRACKS, BEARINGS, [1]), (BEARINGS, TRACKS, [4])):
+        state, nothing = source.sight(source.start(), broken(StreamKind.IMU))
+        assert nothing is None
+        state, seen = seen_by(source, state, first)
+        assert seen.ids.tolist() == expected
+        assert source.sight(state, other)[1] is None
+    state, seen = seen_by(source, source.start(), shot(0))
+    assert len(seen.ids) > 50
+    assert source.sight(state, TRACKS)[1] is None
+
+
+# -------------------------------------------------------------------------------- reference
+
+
+def turned(heading: float) -> np.ndarray:
+    return np.array([0, 0, math.sin(heading / 2), math.cos(heading / 2)])
+
+
+def test_a_surveyed_landmark_s_range_from_a_pose() -> None:
+    world_t_body = np.eye(4)
+    world_t_body[:3, :3] = Rotation.from_euler("z", 0.5).as_matrix()
+    world_t_body[:3, 3] = [1, 2, 0.3]
+    body_t_camera = np.eye(4)
+    body_t_camera[:3, :3], body_t_camera[:3, 3] = FORWARD, [0.2, 0, 0.1]
+    ahead = np.array([math.cos(0.5), math.sin(0.5), 0])
+    left = np.array([-math.sin(0.5), math.cos(0.5), 0])
+    eye = np.array([1, 2, 0.3]) + 0.2 * ahead + [0, 0, 0.1]
+    flat = eye + 3 * ahead - 1 * left
+    landmarks = np.array([eye + 4 * ahead + 3 * left, flat, [*flat[:2], np.nan], [np.nan] * 3])
+    found = reference.surveyed(landmarks, world_t_body, body_t_camera)
+    np.testing.assert_allclose(found.depth_m, [4, 3, 3, np.nan], atol=1e-12)
+    np.testing.assert_allclose(found.distance_m, [5, math.sqrt(10), math.sqrt(10), np.nan], atol=1e-12)
+
+
+def test_a_measured_range_and_its_depth() -> None:
+    found = reference.measured(np.array([2.0, np.nan]), np.array([math.pi / 3, 0]))
+    np.testing.assert_allclose(found.depth_m, [1.0, np.nan])
+    np.testing.assert_allclose(found.distance_m, [2.0, np.nan])
+
+
+def test_the_truth_of_a_simulation() -> None:
+    motion = Waypoints(np.array([0.0, 4.0]), np.array([[0, 0, 0], [2.0, 0, 0]]))
+    mount = Mount(np.array([0.1, 0, 0.5]), FORWARD)
+    found = reference.of_truth(motion, mount, np.array([[5.0, 3, 0.5], [5, 0, 0.5]]), 2.0)
+    np.testing.assert_allclose(found.depth_m, [3.9, 3.9])
+    np.testing.assert_allclose(found.distance_m, [math.hypot(3.9, 3), 3.9])
+
+
+def test_poses_between_poses() -> None:
+    track = PoseTrack(max_gap_s=2.0)
+    assert np.isnan(track.at(0)).all()
+    for t_s, x, heading in ((1, 0.0, 3.0), (2, 4.0, -3.0), (6, 8.0, 0.0)):  # the short way, over π
+        track.add(t_s * 10**9, np.array([x, 1, 0]), turned(heading))
+    track.add(7 * 10**9, np.array([np.nan, 1, 0]), turned(0))
+    track.add(5 * 10**9, np.zeros(3), turned(0))
+    quarter = track.at(1_250_000_000)
+    np.testing.assert_allclose(quarter[:3, 3], [1, 1, 0])
+    turn = 3.0 + 0.25 * (2 * math.pi - 6.0)
+    np.testing.assert_allclose(quarter[:3, :3], Rotation.from_euler("z", turn).as_matrix(), atol=1e-12)
+    np.testing.assert_allclose(track.at(2 * 10**9)[:3, 3], [4, 1, 0])
+    for outside in (999_999_999, 6_000_000_001, 3 * 10**9):  # before, after, in a gap
+        assert np.isnan(track.at(outside)).all()
+    np.testing.assert_allclose(track.at(10**9)[:3, 3], [0, 1, 0])
+    np.testing.assert_allclose(track.at(6 * 10**9)[:3, 3], [8, 1, 0])
+
+
+def pose_sample(t_ns: int, x: float) -> PoseSample:
+    nowhere = np.full((6, 6), np.nan)
+    position = np.array([x, 0.0, 0.0])
+    return PoseSample(
+        stream="/reference", t_ns=t_ns, received_ns=t_ns, position_m=position, quat_xyzw=turned(0), covariance=nowhere
+    )
+
+
+def test_references_are_known_once_the_samples_have_passed() -> None:
+    body_t_camera = np.eye(4)
+    body_t_camera[:3, :3] = FORWARD
+    camera = dataclasses.replace(CAMERA, body_t_camera=body_t_camera)
+    unknown = np.full(3, np.nan)
+    survey = {4: Landmark(position_m=np.array([9.0, 0, 0]), sigma_m=unknown)}
+    known = ReferenceRanges(camera, landmarks=survey, pose_stream="/reference")
+    known.take(pose_sample(0, 0.0))
+    known.take(dataclasses.replace(pose_sample(1, 7.0), stream="/other"))
+    ids = np.array([4, 5])
+    assert np.isnan(known.at(500_000_000, ids).depth_m).all()
+    known.take(pose_sample(10**9, 1.0))
+    np.testing.assert_allclose(known.at(500_000_000, ids).depth_m, [8.5, np.nan])
+    measured = dataclasses.replace(
+        BEARINGS, t_ns=500_000_000, ids=ids, range_m=np.array([3.0, 2.0]), bearing_rad=np.array([0.0, 1.0])
+    )
+    known.take(measured)  # the survey counts more
+    np.testing.assert_allclose(known.at(500_000_000, ids).depth_m, [8.5, 2 * math.cos(1.0)])
+    np.testing.assert_allclose(known.at(500_000_000, ids).distance_m, [8.5, 2.0])
+    assert np.isnan(known.at(500_000_001, ids).depth_m[1])
+    assert known.at(0, np.zeros(0, np.int64)).depth_m.shape == (0,)
+
+
+def test_the_range_of_one_corner_is_known_by_the_whole_board() -> None:
+    settings = BoardSettings(square_m=0.06, landmarks=(0,))
+    known = ReferenceRanges(WIDE, board=settings)
+    sample, inside = board_view(9, 6, 0.06, eye_at(3.0, 0.2, 0.04))
+    known.take(dataclasses.replace(sample, t_ns=77))
+    known.take(image(np.full((360, 480), 128, np.uint8), 78))
+    found = known.at(77, np.array([0, 53, 54]))
+    np.testing.assert_allclose(found.depth_m, [*inside[[0, 53], 2], np.nan], rtol=0.003)
+    assert np.isnan(known.at(78, np.array([0])).depth_m).all()
+    with pytest.raises(ValueError, match="square_m is unknown"):
+        ReferenceRanges(WIDE, board=BoardSettings())
+    with pytest.raises(ValueError, match="calibrated camera"):
+        ReferenceRanges(None, board=settings)
+
+
+# -------------------------------------------------------------------------------- real data
+
+PAIRS = RECORDINGS / "stereo_chessboard"
+
+
+@pytest.mark.skipif(not PAIRS.is_dir(), reason="shared recordings not found")
+def test_every_real_board_is_found_and_the_pairs_agree_on_their_baseline() -> None:
+    """The calibrations that came with the images; the pair's own geometry by OpenCV's stereo calibration."""
+    numbers = [n for n in range(1, 15) if n != 10]
+    storage = {name: cv2.FileStorage(str(PAIRS / f"{name}.yml"), cv2.FILE_STORAGE_READ) for name in NAMES}
+    cameras = {
+        "left": calibrated(storage["left_intrinsics"], "camera_matrix", "distortion_coefficients"),
+        "right": calibrated(storage["intrinsics"], "M2", "D2"),
+    }
+    settings = BoardSettings(square_m=0.025, landmarks="all", first="light")
+    points = chessboard_points(settings)
+    poses: dict[str, list[np.ndarray]] = {"left": [], "right": []}
+    pixels: dict[str, list[np.ndarray]] = {"left": [], "right": []}
+    off: dict[str, list[float]] = {"left": [], "right": []}
+    for side, camera in cameras.items():
+        source = Chessboard(camera, settings)
+        for number in numbers:
+            grey = cv2.imread(str(PAIRS / f"{side}{number:02d}.jpg"), cv2.IMREAD_GRAYSCALE)
+            _, seen = seen_by(source, source.start(), image(grey))
+            assert len(seen.ids) == 54, f"{side}{number:02d}"
+            pose = board_pose(seen.points_px, points, camera)
+            assert pose is not None
+            poses[side].append(pose.camera_t_board)
+            off[side].append(pose.rms_px)
+            pixels[side].append(seen.points_px.astype(np.float32))
+    assert max(off["left"]) < 0.3
+    assert max(off["right"]) < 0.9  # the calibration of that camera is not as good
+    pairs = [right @ np.linalg.inv(left) for left, right in zip(poses["left"], poses["right"], strict=True)]
+    baseline = np.array([np.linalg.norm(pair[:3, 3]) for pair in pairs])
+    plain = [pinhole_matrix(cameras[side]) for side in ("left", "right")]
+    objects = [points.astype(np.float32)] * len(numbers)
+    none = np.zeros(5)
+    together = cv2.stereoCalibrate(
+        objects,
+        pixels["left"],
+        pixels["right"],
+        plain[0],
+        none,
+        plain[1],
+        none,
+        (640, 480),
+        flags=cv2.CALIB_FIX_INTRINSIC,
+    )
+    joint = np.linalg.norm(together[6])
+    print(off, baseline, joint)
+    assert np.median(baseline) == pytest.approx(joint, rel=0.02)
+    assert baseline.std() < 0.05 * joint
+
+
+NAMES = ("left_intrinsics", "intrinsics")
+
+
+def calibrated(storage: Any, matrix: str, distortion: str) -> Camera:
+    k, d = storage.getNode(matrix).mat(), storage.getNode(distortion).mat().ravel()
+    return dataclasses.replace(pinhole(640, 480, 500.0, distortion=d.tolist()), matrix=k)
+
+
+def pinhole_matrix(camera: Camera) -> np.ndarray:
+    return np.array(
+        [[camera.matrix[0, 0], 0, camera.matrix[0, 2]], [0, camera.matrix[0, 0], camera.matrix[1, 2]], [0, 0, 1]]
+    )
