@@ -502,7 +502,7 @@ def test_the_pose_of_a_tilted_board_is_the_right_one_of_two() -> None:
     with pytest.raises(ValueError, match="at least 4"):
         board_pose(pixels[:3], points[:3], WIDE)
     line = points[:5]
-    assert board_pose(shown(line + [0, 0, 2.0]), line, WIDE) is None
+    assert board_pose(shown(line + np.array([0, 0, 2.0])), line, WIDE) is None
 
 
 def test_a_small_board_far_away_has_a_second_pose() -> None:
@@ -565,11 +565,10 @@ def test_corners_and_depths_of_markers(change: dict[str, Any]) -> None:
         np.testing.assert_array_equal(seen.ids, ids)
         inside = eye.in_camera(places_m)
         off = np.linalg.norm(seen.points_px - shown(inside), axis=1)
-        assert off.mean() < 0.15
+        assert off.max() < 0.15
         found = reference.of_markers(seen, settings, WIDE)
-        print(x, off.mean(), off.max(), np.abs(found.depth_m / inside[:, 2] - 1).max())
-        np.testing.assert_allclose(found.depth_m, inside[:, 2], rtol=0.01)
-        np.testing.assert_allclose(found.distance_m, np.linalg.norm(inside, axis=1), rtol=0.01)
+        np.testing.assert_allclose(found.depth_m, inside[:, 2], rtol=0.002)
+        np.testing.assert_allclose(found.distance_m, np.linalg.norm(inside, axis=1), rtol=0.002)
         assert np.all(seen.sigma_px == 0.1)
         again = source.sight(None, image(grey))[1]
         assert again is not None
@@ -792,66 +791,79 @@ def test_the_range_of_one_corner_is_known_by_the_whole_board() -> None:
 # -------------------------------------------------------------------------------- real data
 
 PAIRS = RECORDINGS / "stereo_chessboard"
+NUMBERS = [n for n in range(1, 15) if n != 10]
+PRINTED = BoardSettings(square_m=0.025, landmarks="all", first="light")
+SIDES = ("left", "right")
+needs_pairs = pytest.mark.skipif(not PAIRS.is_dir(), reason="shared recordings not found")
 
 
-@pytest.mark.skipif(not PAIRS.is_dir(), reason="shared recordings not found")
-def test_every_real_board_is_found_and_the_pairs_agree_on_their_baseline() -> None:
-    """The calibrations that came with the images; the pair's own geometry by OpenCV's stereo calibration."""
-    numbers = [n for n in range(1, 15) if n != 10]
-    storage = {name: cv2.FileStorage(str(PAIRS / f"{name}.yml"), cv2.FILE_STORAGE_READ) for name in NAMES}
-    cameras = {
-        "left": calibrated(storage["left_intrinsics"], "camera_matrix", "distortion_coefficients"),
-        "right": calibrated(storage["intrinsics"], "M2", "D2"),
-    }
-    settings = BoardSettings(square_m=0.025, landmarks="all", first="light")
-    points = chessboard_points(settings)
-    poses: dict[str, list[np.ndarray]] = {"left": [], "right": []}
-    pixels: dict[str, list[np.ndarray]] = {"left": [], "right": []}
-    off: dict[str, list[float]] = {"left": [], "right": []}
-    for side, camera in cameras.items():
-        source = Chessboard(camera, settings)
-        for number in numbers:
-            grey = cv2.imread(str(PAIRS / f"{side}{number:02d}.jpg"), cv2.IMREAD_GRAYSCALE)
-            _, seen = seen_by(source, source.start(), image(grey))
-            assert len(seen.ids) == 54, f"{side}{number:02d}"
-            pose = board_pose(seen.points_px, points, camera)
-            assert pose is not None
-            poses[side].append(pose.camera_t_board)
-            off[side].append(pose.rms_px)
-            pixels[side].append(seen.points_px.astype(np.float32))
-    assert max(off["left"]) < 0.3
-    assert max(off["right"]) < 0.9  # the calibration of that camera is not as good
-    pairs = [right @ np.linalg.inv(left) for left, right in zip(poses["left"], poses["right"], strict=True)]
-    baseline = np.array([np.linalg.norm(pair[:3, 3]) for pair in pairs])
-    plain = [pinhole_matrix(cameras[side]) for side in ("left", "right")]
-    objects = [points.astype(np.float32)] * len(numbers)
-    none = np.zeros(5)
-    together = cv2.stereoCalibrate(
-        objects,
-        pixels["left"],
-        pixels["right"],
-        plain[0],
-        none,
-        plain[1],
-        none,
-        (640, 480),
-        flags=cv2.CALIB_FIX_INTRINSIC,
-    )
-    joint = np.linalg.norm(together[6])
-    print(off, baseline, joint)
-    assert np.median(baseline) == pytest.approx(joint, rel=0.02)
-    assert baseline.std() < 0.05 * joint
+@functools.cache
+def real_corners(side: str) -> list[np.ndarray]:
+    """Corners [54, 2] in each image of one camera, with its distortion."""
+    source = Chessboard(pinhole(640, 480, 500.0, model="none"), PRINTED)
+    found = []
+    for number in NUMBERS:
+        grey = cv2.imread(str(PAIRS / f"{side}{number:02d}.jpg"), cv2.IMREAD_GRAYSCALE)
+        found.append(seen_by(source, source.start(), image(grey))[1].points_px)
+    return found
 
 
-NAMES = ("left_intrinsics", "intrinsics")
+def poses_of(camera: Camera, side: str) -> tuple[list[np.ndarray], float]:
+    """The board's pose in each image, and the largest of their reprojection errors."""
+    points = chessboard_points(PRINTED)
+    poses = [board_pose(ideal_px(camera, pixels), points, camera) for pixels in real_corners(side)]
+    return [pose.camera_t_board for pose in poses if pose], max(pose.rms_px for pose in poses if pose)
 
 
-def calibrated(storage: Any, matrix: str, distortion: str) -> Camera:
-    k, d = storage.getNode(matrix).mat(), storage.getNode(distortion).mat().ravel()
-    return dataclasses.replace(pinhole(640, 480, 500.0, distortion=d.tolist()), matrix=k)
+def baselines(cameras: dict[str, Camera]) -> np.ndarray:
+    left, right = (poses_of(cameras[side], side)[0] for side in SIDES)
+    return np.array([np.linalg.norm((b @ np.linalg.inv(a))[:3, 3]) for a, b in zip(left, right, strict=True)])
 
 
-def pinhole_matrix(camera: Camera) -> np.ndarray:
-    return np.array(
-        [[camera.matrix[0, 0], 0, camera.matrix[0, 2]], [0, camera.matrix[0, 0], camera.matrix[1, 2]], [0, 0, 1]]
-    )
+def with_lens(matrix: np.ndarray, distortion: np.ndarray) -> Camera:
+    return dataclasses.replace(pinhole(640, 480, 500.0), matrix=matrix, distortion=distortion.ravel())
+
+
+def stereo(cameras: dict[str, Camera]) -> float:
+    """The baseline by OpenCV's stereo calibration of all pairs together."""
+    corners = [[pixels.astype(np.float32) for pixels in real_corners(side)] for side in SIDES]
+    lenses = [x for side in SIDES for x in (cameras[side].matrix, cameras[side].distortion)]
+    board = [chessboard_points(PRINTED).astype(np.float32)] * len(NUMBERS)
+    together = cv2.stereoCalibrate(board, *corners, *lenses, (640, 480), flags=cv2.CALIB_FIX_INTRINSIC)
+    return float(np.linalg.norm(together[6]))
+
+
+@needs_pairs
+def test_every_real_board_is_found() -> None:
+    for side in SIDES:
+        assert [len(corners) for corners in real_corners(side)] == [54] * 13
+
+
+@needs_pairs
+def test_real_boards_with_the_calibrations_that_came_with_them() -> None:
+    """Those of the file `intrinsics.yml` do not fit its images well: its left lens is off by 1 to 3 px."""
+    storage = [
+        cv2.FileStorage(str(PAIRS / f"{n}.yml"), cv2.FILE_STORAGE_READ) for n in ("left_intrinsics", "intrinsics")
+    ]
+    names = (("camera_matrix", "distortion_coefficients"), ("M2", "D2"))
+    lenses = [[s.getNode(name).mat() for name in pair] for s, pair in zip(storage, names, strict=True)]
+    cameras = {side: with_lens(*lens) for side, lens in zip(SIDES, lenses, strict=True)}
+    assert poses_of(cameras["left"], "left")[1] < 0.3
+    assert poses_of(cameras["right"], "right")[1] < 0.9
+    assert np.median(baselines(cameras)) == pytest.approx(stereo(cameras), rel=0.04)
+
+
+@needs_pairs
+def test_real_boards_with_a_calibration_by_their_own_corners() -> None:
+    board = [chessboard_points(PRINTED).astype(np.float32)] * len(NUMBERS)
+    cameras = {}
+    for side in SIDES:
+        corners = [pixels.astype(np.float32) for pixels in real_corners(side)]
+        flags = cv2.CALIB_FIX_ASPECT_RATIO
+        rms_px, matrix, distortion, _, _ = cv2.calibrateCamera(board, corners, (640, 480), np.eye(3), None, flags=flags)
+        cameras[side] = with_lens(matrix, distortion)
+        assert rms_px < 0.22
+        assert poses_of(cameras[side], side)[1] < 0.3
+    found = baselines(cameras)
+    assert found.mean() == pytest.approx(stereo(cameras), rel=0.005)
+    assert found.std() < 0.01 * found.mean()

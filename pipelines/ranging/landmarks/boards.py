@@ -102,7 +102,7 @@ def chessboard_grid(grey: Grey, settings: BoardSettings) -> Floats | None:
         return None
     grid = np.asarray(corners, dtype=np.float32).reshape(settings.rows, settings.columns, 2)
     nearest = min(float(np.linalg.norm(np.diff(grid, axis=axis), axis=2).min()) for axis in (0, 1))
-    half = int(np.clip(0.4 * nearest, 2, 11))  # the window must hold no other corner
+    half = int(np.clip(0.4 * nearest, 2, 6))  # the window must hold no other corner, nor the board's edge
     refined = cv2.cornerSubPix(grey, grid.reshape(-1, 1, 2).copy(), (half, half), (-1, -1), REFINEMENT)
     return np.asarray(refined, dtype=np.float64).reshape(grid.shape)
 
@@ -249,21 +249,19 @@ def _by_sides(grey: Grey, corners: Floats, cells: int, camera: Camera) -> Floats
         camera: whose image it is.
     """
     for _ in range(SIDE_PASSES):
-        lines = [_side(grey, corners[k], corners[(k + 1) % 4], cells, camera) for k in range(4)]
-        if any(line is None for line in lines):
-            return np.full((4, 2), np.nan)
+        lines = np.array([_side(grey, corners[k], corners[(k + 1) % 4], cells, camera) for k in range(4)])
         crossings = np.cross(np.roll(lines, 1, axis=0), lines)
         points = crossings[:, :2] / crossings[:, 2:]
         corners = seen_px(camera, points)
     return np.asarray(points)
 
 
-def _side(grey: Grey, start: Floats, stop: Floats, cells: int, camera: Camera) -> Floats | None:
-    """The line (a, b, c), a u + b v + c = 0, along a marker's side, freed of distortion; None where there is none."""
+def _side(grey: Grey, start: Floats, stop: Floats, cells: int, camera: Camera) -> Floats:
+    """The line (a, b, c), a u + b v + c = 0, along a marker's side, freed of distortion; NaN where there is none."""
     length = float(np.linalg.norm(stop - start))
     reach = min(0.7 * length / cells, 5.0)
     if not (reach >= 1.0 and np.isfinite(length)):
-        return None
+        return np.full(3, np.nan)
     along = (stop - start) / length
     outward = np.array([along[1], -along[0]])
     places = start + np.linspace(0.1, 0.9, int(np.clip(length, 12, 60)))[:, None] * (stop - start)
@@ -273,11 +271,11 @@ def _side(grey: Grey, start: Floats, stop: Floats, cells: int, camera: Camera) -
     slopes = np.diff(levels, axis=1).clip(min=0) ** 2  # light outside; the steepest counts most
     weight = slopes.sum(axis=1)
     if not np.count_nonzero(weight) >= len(places) / 2:
-        return None
+        return np.full(3, np.nan)
     shift = slopes @ (0.5 * (offsets[1:] + offsets[:-1])) / np.maximum(weight, 1e-9)
     points = ideal_px(camera, (places + shift[:, None] * outward)[weight > 0])
     points = points[np.isfinite(points[:, 0])]
-    return _line(points) if len(points) >= 4 else None
+    return _line(points) if len(points) >= 4 else np.full(3, np.nan)
 
 
 def _line(points: Floats) -> Floats:
