@@ -20,6 +20,7 @@ from pipelines.ranging.landmarks.boards import (
     Chessboard,
     Markers,
     board_pose,
+    chessboard_grid,
     chessboard_points,
     marker_points,
 )
@@ -267,7 +268,9 @@ def broken(kind: StreamKind = StreamKind.IMAGE) -> Problem:
 
 
 @pytest.mark.parametrize(
-    "bad", [image(BLANK), image(np.zeros((120, 160), np.uint8)), broken()], ids=["blank", "size", "torn"]
+    "bad",
+    [image(BLANK), image(np.zeros((120, 160), np.uint8)), broken(), dataclasses.replace(image(BLANK), encoding="png")],
+    ids=["blank", "size", "problem", "torn"],
 )
 def test_a_bad_frame_ends_the_tracks(bad: ImageSample | Problem) -> None:
     source = TrackedCorners(CAMERA, CornerSettings(max_corners=50))
@@ -573,6 +576,41 @@ def test_corners_and_depths_of_markers(change: dict[str, Any]) -> None:
         again = source.sight(None, image(grey))[1]
         assert again is not None
         assert again.points_px.tobytes() == seen.points_px.tobytes()
+
+
+def test_markers_without_a_board_have_each_their_own_pose() -> None:
+    settings = MarkerSettings(marker_m=0.3, columns=2, gap_m=0.1, first_tag=7)
+    plane, _, places_m = printed_markers(settings)
+    motion, eye = eye_at(3.0, 0.1, 0.2)
+    grey = expose(view(Scene(None, planes=(plane,)), WIDE, MOUNT, motion, 0.0), noise_key=1, noise_grey=2.0)
+    alone = MarkerSettings(marker_m=0.3)  # tag 0, which is not there
+    _, seen = seen_by(Markers(WIDE, alone), None, image(grey))
+    found = reference.of_markers(seen, alone, WIDE)
+    np.testing.assert_allclose(found.depth_m, eye.in_camera(places_m)[:, 2], rtol=0.005)
+    few = reference.of_markers(Sighting(seen.ids[:3], seen.points_px[:3], seen.sigma_px[:3]), alone, WIDE)
+    assert np.isnan(few.depth_m).all()
+
+
+def test_a_marker_that_is_too_small_has_no_corners() -> None:
+    dictionary = cv2.aruco.getPredefinedDictionary(cv2.aruco.DICT_7X7_50)
+    small = np.full((360, 480), 230, np.uint8)
+    small[40:76, 60:96] = cv2.aruco.generateImageMarker(dictionary, 5, 36)
+    small[200:212, 60:72] = cv2.aruco.generateImageMarker(dictionary, 6, 12)
+    _, seen = seen_by(Markers(WIDE, MarkerSettings(dictionary="7x7_50")), None, image(small))
+    assert set((seen.ids // 4).tolist()) <= {5}
+    assert np.isfinite(seen.points_px).all()
+
+
+def test_another_board_of_the_same_shape_is_not_taken_for_the_one() -> None:
+    source = Chessboard(WIDE, BoardSettings(columns=8, rows=6, landmarks="all"))
+    sample, _ = board_view(8, 6, 0.06, eye_at(3.0))
+    state, seen = seen_by(source, source.start(), sample)
+    assert len(seen.ids) == 48
+    inverted = image(255 - np.asarray(sample.grey()))
+    assert len(chessboard_grid(inverted.grey(), source.settings)) == 6
+    same, nothing = seen_by(source, state, inverted)
+    assert len(nothing.ids) == 0
+    assert same == state
 
 
 def test_tags_are_chosen_and_those_seen_twice_left_out() -> None:

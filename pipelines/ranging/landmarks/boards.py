@@ -29,6 +29,7 @@ Floats = NDArray[np.float64]
 
 REFINEMENT = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, 50, 1e-3)
 SIDE_PASSES = 3
+"""Times that the sides of a marker are looked for, each about where the last time found them."""
 SAME_POSE = 5e-3
 """Refined poses whose elements (rotations, metres) differ by less are one."""
 
@@ -77,9 +78,10 @@ class Chessboard:
             return state, None
         grey = grey_of(sample, self.camera)
         grid = None if grey is None else chessboard_grid(grey, self.settings)
-        if grey is None or grid is None:
+        found = None if grey is None or grid is None else _numbered(grid, grey, state, self.settings)
+        if found is None:
             return state, NOTHING
-        grid, after = _numbered(grid, grey, state, self.settings)
+        grid, after = found
         numbers = np.array(self.settings.numbers, dtype=np.int64)
         points = ideal_px(self.camera, grid.reshape(-1, 2)[numbers])
         return after, sighting(numbers, points, np.full(len(numbers), self.settings.sigma_px))
@@ -107,8 +109,8 @@ def chessboard_grid(grey: Grey, settings: BoardSettings) -> Floats | None:
     return np.asarray(refined, dtype=np.float64).reshape(grid.shape)
 
 
-def _numbered(grid: Floats, grey: Grey, state: BoardState, settings: BoardSettings) -> tuple[Floats, BoardState]:
-    """The corners [rows, columns, 2] in the board's own numbering, and the state with it."""
+def _numbered(grid: Floats, grey: Grey, state: BoardState, settings: BoardSettings) -> tuple[Floats, BoardState] | None:
+    """The corners [rows, columns, 2] in the board's own numbering, and the state with it; None for another board."""
     wanted = {"light": 1, "dark": -1}.get(settings.first, state.light)
     choices = [turned for turned in _turned(grid) if wanted in (0, _light(turned, grey))]
 
@@ -117,6 +119,8 @@ def _numbered(grid: Floats, grey: Grey, state: BoardState, settings: BoardSettin
         first_time = state.light == 0
         return float(row @ np.array(state.row) + first_time * column[1])
 
+    if not choices:  # no end has the colour that it had
+        return None
     chosen = max(choices, key=upright)
     row, _ = _directions(chosen)
     return chosen, BoardState(_light(chosen, grey), (float(row[0]), float(row[1])))
