@@ -24,7 +24,7 @@ from pipelines.ranging.landmarks.boards import (
     chessboard_points,
     marker_points,
 )
-from pipelines.ranging.landmarks.corners import CornerState, TrackedCorners, least_eigenvalue
+from pipelines.ranging.landmarks.corners import CornerState, TrackedCorners, centred
 from pipelines.ranging.landmarks.frames import ideal_px, seen_px
 from pipelines.ranging.landmarks.recorded import RecordedBearings, RecordedTracks, bearing_camera
 from pipelines.ranging.landmarks.settings import (
@@ -173,7 +173,7 @@ def usual() -> Followed:
 def test_tracks_stay_on_their_points_of_the_wall() -> None:
     track = usual()
     far = np.linalg.norm(track.error, axis=1)
-    assert np.mean(far > 2) < 0.03  # they sit on the poster's edge, half on the wall
+    assert np.mean(far > 2) < 0.05  # they sit on the poster's edge, half on the wall
     for youngest, oldest, limit in ((1, 2, 0.1), (2, 10, 0.2), (10, 20, 0.3), (20, 40, 0.5)):
         chosen = (track.age >= youngest) & (track.age < oldest) & (far <= 2)
         assert chosen.sum() > 100
@@ -307,8 +307,8 @@ def test_the_texture_limit_is_in_grey_levels_per_px() -> None:
     w = 2 * np.pi / 59
     wave = 120 + 60 * np.sin(w * u) * np.cos(w * v)
     slope = 60 * w / 2  # rms over a period, along either axis
-    eigenvalue = cv2.cornerMinEigenVal(np.rint(wave).astype(np.uint8), 59)[30, 30]
-    assert eigenvalue == pytest.approx(least_eigenvalue(slope), rel=0.1)
+    _, texture = centred(np.rint(wave).astype(np.uint8), np.array([[29.0, 29]], np.float32), 59)
+    assert texture[0] == pytest.approx(slope, rel=0.05)
 
 
 def bits(state: CornerState) -> tuple[bytes, ...]:

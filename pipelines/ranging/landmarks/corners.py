@@ -29,6 +29,8 @@ Longs = NDArray[np.int64]
 
 CENTRINGS = 5
 """Steps to a corner's centre; the last ones change nothing."""
+SPARE = 4
+"""Corners that are centred for each one that is needed: some lie on edges or come together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -143,47 +145,45 @@ class TrackedCorners:
         free[edge : grey.shape[0] - edge, edge : grey.shape[1] - edge] = 255
         for u, v in taken:
             cv2.circle(free, (round(float(u)), round(float(v))), round(s.min_distance_px), 0, -1)
-        textured = cv2.cornerMinEigenVal(grey, s.window_px) >= least_eigenvalue(s.min_texture)
-        free[~textured] = 0
         best = cv2.goodFeaturesToTrack(grey, 0, s.quality, s.min_distance_px, mask=free, blockSize=s.window_px)
         if best is None:
             return np.zeros((0, 2), dtype=np.float32)
-        best = best.reshape(-1, 2)
-        middle = centred(grey, best, s.window_px)
-        near = np.linalg.norm(middle - best, axis=1) <= 0.5 * s.window_px
-        best = middle[near & inside(middle, grey.shape, s.border_px)]
-        best = best[_apart(best, 0.5 * s.min_distance_px)]
-        return _spread(best, taken, grey.shape, s)
+        room = max(s.max_corners - len(taken), 0)
+        chosen = _spread(best.reshape(-1, 2), taken, grey.shape, s)[: SPARE * room]
+        points, texture = centred(grey, chosen, s.window_px)
+        near = np.linalg.norm(points - chosen, axis=1) <= 0.5 * s.window_px
+        points = points[near & (texture >= s.min_texture) & inside(points, grey.shape, s.border_px)]
+        kept: Singles = points[_apart(points, 0.5 * s.min_distance_px)][:room]
+        return kept
 
 
-def least_eigenvalue(texture: float) -> float:
-    """What OpenCV's `cornerMinEigenVal` gives of 8-bit images for an rms gradient in grey levels per px.
-
-    λ = (2 g / 255)²: the mean square of central differences over two px, of grey levels from 0 to 1.
-    """
-    return (2.0 * texture / 255.0) ** 2
-
-
-def centred(grey: Grey, points: Singles, window_px: int) -> Singles:
-    """Points [n, 2] moved to where a window about them can grow without drifting.
+def centred(grey: Grey, points: Singles, window_px: int) -> tuple[Singles, Floats]:
+    """Points [n, 2] moved to where a window about them can grow without drifting, and the texture there [n].
 
     Lucas-Kanade shifts a window until Σ g gᵀ (motion - shift) = 0, g the gradients in it. As the scene comes nearer by
     a share s, a place q moves by s (q - c) from the point c, so that the shift is 0 where Σ g gᵀ (q - c) = 0: then c
     stays the same point of the scene. It is the point to which `cornerSubPix` (Förstner, Gülch, 1987) leads, with the
     equal weights of the tracker's window.
+
+    The texture is the rms gradient along the direction in which it is weakest, grey levels per px.
     """
-    v, u = np.mgrid[: grey.shape[0], : grey.shape[1]].astype(np.float64)
-    gu, gv = (cv2.Scharr(grey, cv2.CV_64F, dx, dy, scale=1 / 32) for dx, dy in ((1, 0), (0, 1)))
-    products = (gu * gu, gu * gv, gv * gv, gu * gu * u + gu * gv * v, gu * gv * u + gv * gv * v)
-    uu, uv, vv, along, down = (cv2.blur(product, (window_px, window_px)) for product in products)
+    gradients = [cv2.Scharr(grey, cv2.CV_32F, dx, dy, scale=1 / 32) for dx, dy in ((1, 0), (0, 1))]
+    half = window_px // 2
+    v, u = np.mgrid[-half : half + 1, -half : half + 1]
+    last = np.array([grey.shape[1] - 1, grey.shape[0] - 1]) - half
     moved = points.astype(np.float64)
     for _ in range(CENTRINGS):
-        columns, rows = np.rint(moved).astype(np.int64).T
-        at = (rows.clip(0, grey.shape[0] - 1), columns.clip(0, grey.shape[1] - 1))
-        a, b, c = uu[at], uv[at], vv[at]
-        det = np.maximum(a * c - b * b, 1e-12)
-        moved = np.column_stack([c * along[at] - b * down[at], a * down[at] - b * along[at]]) / det[:, None]
-    return moved.astype(np.float32)
+        at = np.rint(moved).astype(np.int64).clip(half, last)
+        window = (at[:, 1, None, None] + v, at[:, 0, None, None] + u)
+        gu, gv = (gradient[window].astype(np.float64) for gradient in gradients)
+        uu, uv, vv, along, down = (
+            product.sum(axis=(1, 2))
+            for product in (gu * gu, gu * gv, gv * gv, gu * (gu * u + gv * v), gv * (gu * u + gv * v))
+        )
+        det = np.maximum(uu * vv - uv * uv, 1e-12)
+        moved = at + np.column_stack([vv * along - uv * down, uu * down - uv * along]) / det[:, None]
+    weakest = 0.5 * (uu + vv) - np.hypot(0.5 * (uu - vv), uv)
+    return moved.astype(np.float32), np.sqrt(weakest.clip(min=0) / window_px**2)
 
 
 def evened(before: Grey, now: Grey, jump: float) -> Grey:
@@ -213,7 +213,7 @@ def _apart(points: Singles, distance_px: float) -> NDArray[np.bool_]:
 
 
 def _spread(best: Singles, taken: Singles, shape: tuple[int, ...], s: CornerSettings) -> Singles:
-    """As many of the corners [n, 2], best first, as there is room for, in the emptiest cells of the grid first.
+    """The corners [n, 2], which come best first, in the order of their turn: in the emptiest cells of the grid first.
 
     Round by round every cell that has fewest tracks takes its next best corner, so that texture in one place does
     not take all tracks.
@@ -230,5 +230,4 @@ def _spread(best: Singles, taken: Singles, shape: tuple[int, ...], s: CornerSett
     for number, where in enumerate(cell):
         rank[number] = occupancy[where]
         occupancy[where] += 1
-    order = np.lexsort((np.arange(len(best)), rank))
-    return best[order[: max(s.max_corners - len(taken), 0)]]
+    return best[np.argsort(rank, kind="stable")]
