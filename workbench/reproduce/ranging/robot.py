@@ -324,7 +324,9 @@ def robot(seeds: int, runs: int, tick: Tick) -> Robot:
         facts=facts,
         seeds=seeds,
         table=tuple(_column(scale, drives, error) for scale in TABLE_3),
-        converged_s=curve(_converged_s(found.frame_s - facts.start_s, e) for (found, _, _), e in zip(drives, error, strict=True)),
+        converged_s=curve(
+            _converged_s(found.frame_s - facts.start_s, e) for (found, _, _), e in zip(drives, error, strict=True)
+        ),
         within_one=float(np.mean(np.abs(off[:, moving]) < 1)),
         within_two=float(np.mean(np.abs(off[:, moving]) < 2)),
         implied=implied,
