@@ -38,14 +38,13 @@ def convergence(found: Convergence, varied: str, unit: str, title: str) -> Figur
     for axis, r in zip(axes[0], sigmas, strict=True):
         rows = found.of(varied, r)
         _curves(axis, found.time_s, [(f"{row.value:g} {unit}", row.error_m) for row in rows])
-        axis.axhline(0.8, color="grey", ls="--", lw=1)
+        axis.axhline(0.8, color="grey", ls="--", lw=1, label="10 % of the range")
         axis.set_yscale("log")
-        axis.set_ylim(0.03, 20)
+        axis.set_ylim(0.03, 8)
         axis.set_title(f"pixel noise {r:g} px")
         axis.set_xlabel("time, s")
-    axes[0, 0].text(0.02, 0.83, "10 % of the range", color="dimgrey", fontsize=8, va="bottom")
     axes[0, 0].set_ylabel("mean |range error|, m")
-    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=6)
+    figure.legend(*axes[0, 0].get_legend_handles_labels(), loc="outside lower center", ncols=7)
     figure.suptitle(title)
     return figure
 

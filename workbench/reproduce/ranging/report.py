@@ -21,7 +21,6 @@ from workbench.reproduce.documents import (
     write_json,
 )
 from workbench.reproduce.ranging import pictures
-from workbench.reproduce.ranging import simulation as sim
 from workbench.reproduce.ranging.results import Results
 from workbench.reproduce.ranging.robot import BAND, START_FACTOR, TABLE_3, Robot
 from workbench.reproduce.ranging.simulation import (
@@ -38,7 +37,7 @@ from workbench.session import versions
 
 # ---------------------------------------------------------------------------------- tables
 
-TABLE_1 = (
+TABLE_1: tuple[tuple[str, ...], ...] = (
     ("interval dt", "0.1 s", "0.1 s"),
     ("time T", "3 s", "5 s (Table 2's columns are T = 1 … 5 s), 3 s in Figs 6, 7"),
     ("σ_ω", "0.001 rad/s·√Hz", "0.001 rad/s/√Hz"),
@@ -50,7 +49,7 @@ TABLE_1 = (
 
 def table_1() -> Table:
     """Table 1 as printed and as it is taken here."""
-    return ("", "printed", "here"), [tuple(row) for row in TABLE_1]
+    return ("", "printed", "here"), list(TABLE_1)
 
 
 def table_2(found: Accuracy) -> Table:
@@ -90,7 +89,7 @@ def convergence_table(found: Convergence) -> Table:
 
 def scaling_table(found: Scaling) -> Table:
     """What is the same at the same L, and what is not."""
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (f"space x {found.space_factor:g}, σ_V too", "", f"largest change of any error {found.space:.1e}"),
         (f"{found.time_factor:g} times as fast, dt and noise too", "", f"largest change of any error {found.time:.1e}"),
     ]
@@ -105,7 +104,7 @@ def consistency_table(found: Consistency) -> Table:
     """The standard case at its times."""
     heads = ("r px", "t s", "mean error m", "RMS/CRB", "NEES", "NIS", "within 2 σ_ξ", "diverged %")
     times = np.array(found.time_s)
-    rows = []
+    rows: list[tuple[str, ...]] = []
     for row in found.rows:
         for t in (1.0, 2.0, 3.0, 4.0, 5.0):
             k = int(np.argmin(np.abs(times - t)))
@@ -143,7 +142,7 @@ def better_table(found: Better) -> Table:
 def misprints_table(found: Misprints) -> Table:
     """What each formula as printed does at 3 s."""
     heads = ("as printed", "setting", "case", "RMS x", "σ_ξ x", "bias %", "NEES", "NIS")
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (row.name, row.setting, row.case, f"{row.rms:.4f}", f"{row.sigma:.3f}", f"{100 * row.bias:+.2f}",
          f"{row.nees:.2f}", f"{row.nis:.2f}")
         for row in found.rows
@@ -154,7 +153,7 @@ def misprints_table(found: Misprints) -> Table:
 def asynchronous_table(found: Asynchronous) -> Table:
     """Every way to synchronise."""
     heads = ("between two messages", "r px", "RMS % at 5 s", "at 12 s", "bias % at 5 s", "at 12 s", "NEES")
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (row.how, f"{row.pixel_sigma:g}", *(f"{100 * v:.2f}" for v in row.rms), *(f"{100 * v:+.2f}" for v in row.bias),
          f"{row.nees:.1f}")
         for row in found.rows
@@ -178,7 +177,7 @@ def table_3(found: Robot) -> Table:
 def implied_table(found: Robot) -> Table:
     """Medians of Table 3 by the odometer's noise, in %."""
     heads = ("σ_V m/s/√Hz", *(f"L {scale:g}" for scale in TABLE_3), "bound at the last", "as good at the last two")
-    rows = [
+    rows: list[tuple[str, ...]] = [
         (f"{row.sigma_speed:g}", *(f"{100 * value:.2f}" for value in row.median), f"{100 * row.bound[-1]:.2f}",
          f"{100 * row.as_good:.1f} % of runs")
         for row in found.implied
@@ -189,7 +188,9 @@ def implied_table(found: Robot) -> Table:
 def ways_table(found: Robot) -> Table:
     """Ways to feed the filter."""
     heads = ("fed", f"error % at L = {max(TABLE_3):g}", "error % at the end", "in σ_ξ")
-    rows = [(way.name, f"{100 * way.last:.2f}", f"{100 * way.end:.2f}", f"{way.sigmas:.1f}") for way in found.ways]
+    rows: list[tuple[str, ...]] = [
+        (way.name, f"{100 * way.last:.2f}", f"{100 * way.end:.2f}", f"{way.sigmas:.1f}") for way in found.ways
+    ]
     return heads, rows
 
 
@@ -280,9 +281,9 @@ def _lines(results: Results, folder: Path) -> Iterator[str]:
 
 
 def _simulation(results: Results, made: Mapping[str, Table], folder: Path) -> Iterator[str]:
-    if results.accuracy:
+    if (accuracy := results.accuracy) is not None:
         yield from ("", "## Table 2, Fig. 8", "", *markdown(made["Table 2"]), "", TABLE_2)
-        yield from picture(folder, "fig8", lambda: pictures.accuracy(results.accuracy, results.scaling))
+        yield from picture(folder, "fig8", lambda: pictures.accuracy(accuracy, results.scaling))
     if results.convergence:
         found = results.convergence
         yield from ("", "## Figs 6, 7", "", *markdown(made["Figs 6, 7: convergence"]))
@@ -314,12 +315,12 @@ TABLE_2 = (
     "consistent. 10 % after: first time at which the mean error is below a tenth of the range."
 )
 MISPRINTS = (
-    "At 3 s; RMS and σ_ξ as factors over the right form in the same case, so that 1 is no effect. NEES should be 3, NIS 2. "
-    "K = P H(…) in (25) has the wrong dimensions; the units of Table 1 are those of the right column above."
+    "At 3 s; RMS and σ_ξ as factors over the right form in the same case, so that 1 is no effect. NEES should be 3, "
+    "NIS 2. K = P H(…) in (25) has the wrong dimensions; the units of Table 1 are those of the right column above."
 )
 RATES = (
-    "IMU 50, odometer 20, camera 5 Hz; a ramp of 3 s to 0.3 m/s, weaving with 0.1 rad/s. As printed: the interval since "
-    "the message before, of any type, with the other speed 0."
+    "IMU 50, odometer 20, camera 5 Hz; a ramp of 3 s to 0.3 m/s, weaving with 0.1 rad/s. As printed: the interval "
+    "since the message before, of any type, with the other speed 0."
 )
 
 
@@ -328,12 +329,16 @@ def _robot(found: Robot, made: Mapping[str, Table], folder: Path) -> Iterator[st
     yield from ("", "## Table 3, Figs 10-12: a replica of the robot's run", "")
     yield (
         f"`workbench simulate paper-b`: {facts.start_s:g} s of standing, then forth and back before a chessboard whose "
-        f"upper-left corner is {facts.distance_m:.2f} m away, at {facts.speed_mps:.2f} m/s; camera {facts.camera_hz:g} Hz, "
-        f"IMU {facts.gyro_hz:g} Hz, odometer {facts.odometer_hz:g} Hz; f = {facts.focal_px:g} px, corners to "
-        f"{facts.pixel_sigma:g} px, σ_ω = {facts.sigma_omega:g} rad/s/√Hz, σ_V = {facts.sigma_speed:g} m/s/√Hz. The "
-        "paper states neither distance, speed, lens nor noise: distance and speed are such that Table 3's first L is "
-        "reached after the 1.5-2 s in which its filter converges, and its last within 20 s; the odometer's noise is what "
-        f"the table by odometer leaves. The start is {START_FACTOR:g} times the true range. Errors in %."
+        f"upper-left corner is {facts.distance_m:.2f} m away, at {facts.speed_mps:.2f} m/s; camera "
+        f"{facts.camera_hz:g} Hz, IMU {facts.gyro_hz:g} Hz, odometer {facts.odometer_hz:g} Hz; f = {facts.focal_px:g} "
+        f"px, corners to {facts.pixel_sigma:g} px, σ_ω = {facts.sigma_omega:g} rad/s/√Hz, σ_V = {facts.sigma_speed:g} "
+        f"m/s/√Hz. The start is {START_FACTOR:g} times the true range."
+    )
+    yield ""
+    yield (
+        "The paper states neither distance, speed, lens nor noise. Distance and speed are such that Table 3's first L "
+        "is reached after the 1.5-2 s in which its filter converges, and its last within 20 s; the odometer's noise is "
+        "what Table 3 leaves, see below. Errors in %."
     )
     yield from ("", *markdown(made["Table 3"]))
     yield from picture(folder, "table3", lambda: pictures.table_3(found))

@@ -24,7 +24,7 @@ from pipelines.ranging.start import from_range
 from pipelines.simulation.motion import FORWARD
 from pipelines.simulation.scenario import FRONT_TRACKS, Scenario, landmarks_of
 from pipelines.simulation.scene import chessboard_corners
-from pipelines.simulation.sensors import IMU, ODOMETRY
+from pipelines.simulation.sensors import IMU, ODOMETRY, Imu, Odometer, Tracks
 from readers.streams import Camera, ImuSample, OdometrySample, TrackSample
 from workbench import scenarios
 from workbench.reproduce.ranging.parts import Curve, Part
@@ -141,9 +141,9 @@ def in_camera(vector: Floats) -> Floats:
 
 
 def board_depths(found: Drive) -> Floats:
-    """Depth of the upper-left corner by perspective-n-point from all corners of the board [k], m: the paper's reference.
+    """Depth of the upper-left corner by perspective-n-point from all corners of the board [k], m.
 
-    NaN where not all corners are seen.
+    This is the paper's reference. NaN where not all corners are seen.
     """
     board = found.scenario.surroundings.chessboard
     if board is None:
@@ -181,13 +181,14 @@ class Ranged(NamedTuple):
 
 def settings_of(scenario: Scenario) -> FilterSettings:
     """The filter told the noise that the scenario's sensors have."""
+    imu, odometer, tracks = _sensors(scenario)
+    return FilterSettings(sigma_omega=imu.gyro_density, sigma_speed=odometer.speed_density, pixel_sigma=tracks.noise_px)
+
+
+def _sensors(scenario: Scenario) -> tuple[Imu, Odometer, Tracks]:
     if scenario.imu is None or scenario.odometer is None or scenario.tracks is None:
-        raise ValueError(f"scenario {scenario.name}: it needs imu, odometer and tracks")
-    return FilterSettings(
-        sigma_omega=scenario.imu.gyro_density,
-        sigma_speed=scenario.odometer.speed_density,
-        pixel_sigma=scenario.tracks.noise_px,
-    )
+        raise ValueError(f"scenario {scenario.name}: it needs the sections imu, odometer and tracks")
+    return scenario.imu, scenario.odometer, scenario.tracks
 
 
 def ranged(found: Drive, how: Synchronisation = Synchronisation.MIDPOINT, *, stops: bool = True) -> Ranged:
@@ -243,7 +244,7 @@ class Robot(Part):
         parallax_px: Curve
 
     class Column(Part):
-        """One L: |error| over the runs, its RMS, the filter's σ, the reference's own RMS, share as good as the paper."""
+        """One L: |error| over the runs, the filter's σ, RMS of the reference, share as good as the paper."""
 
         scale: float
         paper: float
@@ -256,7 +257,7 @@ class Robot(Part):
         as_good: float
 
     class Implied(Part):
-        """Table 3 with an odometer of another noise, by Monte Carlo: medians, bound, share as good at the last two L."""
+        """Table 3 by Monte Carlo with an odometer of this noise; `as_good`: share of runs at the last two L."""
 
         sigma_speed: float
         median: Curve
@@ -336,22 +337,22 @@ def robot(seeds: int, runs: int, tick: Tick) -> Robot:
 
 
 def _facts(found: Drive) -> Robot.Facts:
-    scenario, settings = found.scenario, settings_of(found.scenario)
-    assert scenario.front is not None and scenario.imu is not None and scenario.odometer is not None
+    imu, odometer, tracks = _sensors(found.scenario)
+    settings = settings_of(found.scenario)
     moving = np.flatnonzero(np.diff(found.way_m) > 0)
     places = found.camera.matrix[0, 0] * found.point_m[:, :2] / found.point_m[:, 2:]
     return Robot.Facts(
         distance_m=found.distance_m,
         focal_px=float(found.camera.matrix[0, 0]),
         speed_mps=float(np.max(np.diff(found.way_m) / np.diff(found.frame_s))),
-        start_s=float(scenario.trajectory.profile_parameters["stop_s"]),
-        gyro_hz=scenario.imu.timing.rate_hz,
-        odometer_hz=scenario.odometer.timing.rate_hz,
-        camera_hz=scenario.front.timing.rate_hz,
+        start_s=float(found.scenario.trajectory.profile_parameters["stop_s"]),
+        gyro_hz=imu.timing.rate_hz,
+        odometer_hz=odometer.timing.rate_hz,
+        camera_hz=tracks.timing.rate_hz,
         sigma_omega=settings.sigma_omega,
         sigma_speed=settings.sigma_speed,
         pixel_sigma=settings.pixel_sigma,
-        parallax_px=curve(np.linalg.norm(places[found.at(scale)] - places[moving[0]]) for scale in TABLE_3),
+        parallax_px=curve(np.hypot(*(places[found.at(scale)] - places[moving[0]])) for scale in TABLE_3),
     )
 
 
