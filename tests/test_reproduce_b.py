@@ -3,10 +3,12 @@
 import csv
 import json
 import math
+from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from pipelines.ranging import montecarlo as mc
 from pipelines.ranging.inputs import Synchronisation
@@ -24,12 +26,19 @@ RUNS, SEEDS = 40, 2
 
 
 @pytest.fixture(scope="module", autouse=True)
-def one_whole_run() -> None:
-    """Ways to feed the filter are compared by one run."""
+def quick() -> None:
+    """Ways to feed the filter are compared by one run; pictures are drawn once, as small PNGs."""
     patch = pytest.MonkeyPatch()
     patch.setattr(robot, "WAYS_RUNS", 1)
+    patch.setattr(drawing, "save", saved_small)
     yield
     patch.undo()
+
+
+def saved_small(file: Path, draw: Callable[[], Figure]) -> Path:
+    png = file.with_suffix(".png")
+    draw().savefig(png, dpi=50)
+    return png
 
 
 @pytest.fixture(scope="module")

@@ -699,7 +699,7 @@ def _print_statements(statements: Iterable[Statement], unfinished: Iterable[str]
     epilog=_examples(
         "workbench reproduce paper-b",
         "workbench reproduce paper-b --runs 1000 --seeds 100",
-        "workbench simulate paper-b -o paper-b.mcap     the robot's run as a log",
+        "workbench simulate paper-b -o paper-b.mcap",
     ),
 )
 def reproduce_paper_b(
