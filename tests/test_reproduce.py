@@ -15,9 +15,10 @@ from pipelines.simulation import trajectories as way
 from pipelines.simulation.families import ground
 from readers.streams import ImageSample, RecordingError, StreamKind
 from workbench import cli
-from workbench.reproduce import conditions, correction, estimates, experiment, limits, matrix, paper_a, report
+from workbench.reproduce import conditions, correction, drawing, estimates, experiment, limits, matrix, paper_a, report
 from workbench.reproduce import pictures as drawn
 from workbench.reproduce import statements as said
+from workbench.reproduce.judged import Upshot
 from workbench.reproduce.ledger import Ledger
 from workbench.reproduce.measures import Accuracy, accuracy, block_ratio, relative_rms
 from workbench.reproduce.tasks import carried_out
@@ -201,7 +202,7 @@ def test_correction_without_images_helps_and_harms_as_the_study_measured() -> No
     upshots = [
         s.upshot for s in (said.correction_helps(list(found.values())), said.correction_harms(list(found.values())))
     ]
-    assert upshots == [said.Upshot.REACHED] * 2
+    assert upshots == [Upshot.REACHED] * 2
 
 
 # ------------------------------------------------------------------------------ statements
@@ -221,17 +222,17 @@ def test_statements_follow_the_numbers() -> None:
     good = runs_of(made_up(relative_euclid=0.05), made_up(relative_euclid=0.001))
     bad = runs_of(made_up(relative_euclid=0.2, relative_y=0.3, failures=3), made_up(relative_euclid=0.1))
     (relative, end, better, *_) = said.statements({"C0": [good]}, [])
-    assert [s.upshot for s in (relative, end, better)] == [said.Upshot.REACHED] * 3
+    assert [s.upshot for s in (relative, end, better)] == [Upshot.REACHED] * 3
     assert "50 times" in better.numbers
     (relative, end, better, corrected, failures) = said.statements({"C0": [bad]}, [])
-    assert relative.upshot is said.Upshot.MISSED
+    assert relative.upshot is Upshot.MISSED
     assert "Y and Euclid above" in relative.numbers
-    assert better.upshot is said.Upshot.MISSED
-    assert corrected.upshot is said.Upshot.MISSED
-    assert failures.upshot is said.Upshot.MISSED
+    assert better.upshot is Upshot.MISSED
+    assert corrected.upshot is Upshot.MISSED
+    assert failures.upshot is Upshot.MISSED
     assert "paper-a: 3 of 99" in failures.numbers
     both = said.relative_rms_of("C3", [bad, good, bad])
-    assert both.upshot is said.Upshot.IN_SCATTER
+    assert both.upshot is Upshot.IN_SCATTER
     assert said.correction_of("C4", [runs_of(made_up(rms_m=0.1), made_up(), made_up(rms_m=0.05))]).upshot == "reached"
     far = runs_of(made_up(), made_up(), made_up(end_x=0.5))
     assert said.end_point_of("C4", [far]).upshot == "reached"  # without correction it is near enough
@@ -334,7 +335,7 @@ def test_what_is_logged_is_what_is_judged(done: paper_a.Reproduced, folder: Path
 @pytest.fixture
 def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
     """Reports without drawing their pictures again."""
-    monkeypatch.setattr(report.pictures, "save", lambda file, draw: file.with_suffix(".png"))
+    monkeypatch.setattr(drawing, "save", lambda file, draw: file.with_suffix(".png"))
 
 
 @pytest.mark.usefixtures("undrawn")
@@ -395,7 +396,7 @@ def test_matrix_is_filled_once_and_goes_on(tmp_path: Path) -> None:
     assert len(lines[0]) == len(heads)
     changed = [dataclasses.replace(place, overrides=("fragment_side_px=21",)) for place in wanted]
     assert matrix.missing_of(changed, results) == changed
-    assert drawn.save(tmp_path / "matrix", lambda: drawn.matrix(rows, ["gravel"])).stat().st_size > 10_000
+    assert drawing.save(tmp_path / "matrix", lambda: drawn.matrix(rows, ["gravel"])).stat().st_size > 10_000
 
 
 def stop_at(done: int, last: int) -> None:
@@ -435,7 +436,7 @@ def test_every_case_of_the_limits_is_in_a_table_once() -> None:
 def test_pictures_are_the_same_for_the_same_numbers(done: paper_a.Reproduced, tmp_path: Path) -> None:
     run = done.results.runs[0]
     for name in ("one", "two"):
-        drawn.save(tmp_path / name, lambda: drawn.errors(run))
+        drawing.save(tmp_path / name, lambda: drawn.errors(run))
     for suffix in ("png", "svg"):
         assert (tmp_path / f"one.{suffix}").read_bytes() == (tmp_path / f"two.{suffix}").read_bytes()
 

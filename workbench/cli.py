@@ -24,6 +24,8 @@ import typer
 if TYPE_CHECKING:
     from pipelines.simulation.mission import SimulatedMission
     from readers.streams import Camera, ReadOptions, Recording, StreamInfo
+    from workbench.reproduce import paper_b
+    from workbench.reproduce.judged import Statement
     from workbench.reproduce.paper_a import Reproduced
     from workbench.session import Outcome, Progress, Request
 
@@ -681,13 +683,65 @@ def _print_reproduced(done: Reproduced) -> None:
     tables += report.limits_tables(results.limits).values() if results.limits else []
     for heads, rows in tables:
         print("\n".join(table(heads, rows, right=range(2, len(heads)))), end="\n\n")
-    for statement in results.statements:
-        print(f"{statement.upshot}: {statement.claim}\n    {statement.numbers}")
-    for text in results.unfinished:
-        print(f"not finished: {text}; the same command goes on")
-    print(f"\nreport  {done.file}")
+    _print_statements(results.statements, results.unfinished, done.file)
     for log in results.logs:
         print(f"log     workbench view {log}")
+
+
+def _print_statements(statements: Iterable[Statement], unfinished: Iterable[str], report: Path) -> None:
+    for statement in statements:
+        print(f"{statement.upshot}: {statement.claim}\n    {statement.numbers}")
+    for text in unfinished:
+        print(f"not finished: {text}; the same command goes on")
+    print(f"\nreport  {report}")
+
+
+@reproduce.command(
+    "paper-b",
+    short_help="Range to landmarks from ego-motion (paper B, section 4).",
+    epilog=_examples(
+        "workbench reproduce paper-b",
+        "workbench reproduce paper-b --runs 1000 --seeds 100",
+        "workbench simulate paper-b -o paper-b.mcap",
+    ),
+)
+def reproduce_paper_b(
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of the results.")] = Path(
+        "results/paper-b"
+    ),
+    runs: Annotated[int, typer.Option(metavar="N", help="Runs of each Monte Carlo; the paper has 1000.")] = 4000,
+    seeds: Annotated[int, typer.Option(metavar="N", help="Runs of the robot's replica.")] = 40,
+    as_json: AsJson = False,
+) -> None:
+    """Repeat paper B's Tables 1-3 and Figs 6-8, 10-12 beside the paper's numbers, with bounds and consistency.
+
+    The folder then holds report.md with tables and pictures, and the same values as JSON and CSV. Ctrl-C leaves
+    the finished parts; the same command goes on with the others.
+    """
+    import shlex
+
+    from workbench.reproduce import paper_b
+    from workbench.reproduce.ranging import report
+
+    words = ["workbench", "reproduce", "paper-b", "-o", str(out), "--runs", str(runs), "--seeds", str(seeds)]
+    plan = paper_b.Plan(out=out, runs=runs, seeds=seeds, command=shlex.join(words))
+    with _Bars() as bars:
+        done = paper_b.reproduce(plan, bars)
+    if as_json:
+        _print_json(report.values(done.results) | {"folder": str(done.folder), "interrupted": done.interrupted})
+    else:
+        _print_ranges(done)
+    raise typer.Exit(INTERRUPTED if done.interrupted else 0)
+
+
+def _print_ranges(done: paper_b.Reproduced) -> None:
+    """Print the tables and statements of paper B's experiments for people."""
+    from workbench.reproduce.ranging import report
+    from workbench.reproduce.ranging.statements import statements
+
+    for name, (heads, rows) in report.tables(done.results).items():
+        print("\n".join((name, *table(heads, rows))), end="\n\n")
+    _print_statements(statements(done.results), done.results.unfinished, done.file)
 
 
 # ------------------------------------------------------------------------------- settings

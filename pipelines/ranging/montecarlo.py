@@ -288,16 +288,22 @@ def starts(scenario: Scenario, pixel: Floats) -> Floats:
     return start
 
 
-def run(scenario: Scenario, settings: FilterSettings | None = None, still: NDArray[np.bool_] | None = None) -> Runs:
+def run(
+    scenario: Scenario,
+    settings: FilterSettings | None = None,
+    still: NDArray[np.bool_] | None = None,
+    landmark: int = 0,
+) -> Runs:
     """Simulate a scenario and filter every run.
 
     Args:
         scenario: what is simulated.
         settings: of the filter; default: the plain filter with the scenario's noise.
         still: intervals in which the filter knows the camera to stand [m] or [n, m]; default: none.
+        landmark: its number, see `simulate`.
     """
     settings = settings or scenario.settings()
-    data = simulate(scenario)
+    data = simulate(scenario, landmark)
     start = starts(scenario, data.pixel)
     n, m = data.omega.shape
     history = np.empty((n, m, kernels.HISTORY))

@@ -10,9 +10,9 @@ from pathlib import Path
 from typing import Any
 
 from pipelines.simulation.families import FAMILIES
-from readers.streams import RecordingError
 from workbench.reproduce import correction, experiment, limits, matrix, report
 from workbench.reproduce.conditions import CONDITIONS, FRAMES, surface_of
+from workbench.reproduce.documents import made_folder
 from workbench.reproduce.tasks import carried_out
 from workbench.settings import SettingsError
 
@@ -116,11 +116,7 @@ def _check(plan: Plan) -> None:
     if plan.surface is not None and plan.surface not in FAMILIES:
         surface_of(plan.surface, 0)
     plan.cells[0].identity  # noqa: B018 (the settings are checked before anything is computed)
-    try:
-        plan.out.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        problem = f"no results can be written there ({error.strerror or error})"
-        raise RecordingError(plan.out, problem, "choose another folder with -o") from error
+    made_folder(plan.out)
 
 
 class _Work:

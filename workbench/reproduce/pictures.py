@@ -1,18 +1,15 @@
-"""The pictures of paper A's experiment: like its Figs 5 and 6, and those of correction, matrix and limits.
-
-PNG and SVG, the same bytes for the same numbers. Colours are those of Okabe and Ito, which colour-blind people
-can tell apart; every curve has a sign of its own as well.
-"""
+"""The pictures of paper A's experiment: like its Figs 5 and 6, and those of correction, matrix and limits."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from workbench.reproduce.correction import READINGS, TRUTHS, Effect
+from workbench.reproduce.drawing import BLACK, BLUE, GREEN, ORANGE, RED, figure_of
 from workbench.reproduce.experiment import BEST, PAPER, PRINTED, PRIOR, Run
 
 if TYPE_CHECKING:
@@ -21,8 +18,6 @@ if TYPE_CHECKING:
 
 POINT_FRAMES = 25
 """The paper plots every 25th frame."""
-DOTS_PER_INCH = 110
-BLACK, ORANGE, BLUE, GREEN, RED = "#000000", "#E69F00", "#0072B2", "#009E73", "#D55E00"
 COLOURS = {PAPER: RED, PRIOR: BLUE, PRINTED: ORANGE, BEST: GREEN}
 SIGNS = {PAPER: "+", PRIOR: "*", PRINTED: "^", BEST: "o"}
 LABELS = {
@@ -31,28 +26,6 @@ LABELS = {
     PRINTED: "with correction (as printed)",
     BEST: "best",
 }
-
-
-def save(file: Path, draw: Callable[[], Figure]) -> Path:
-    """Draw a picture into FILE.png and FILE.svg; returns the PNG."""
-    import matplotlib as mpl
-
-    style: Any = {"svg.hashsalt": "workbench", "font.size": 9.0, "axes.grid": True, "grid.alpha": 0.3}
-    with mpl.rc_context(style):
-        figure = draw()
-        figure.savefig(file.with_suffix(".png"), dpi=DOTS_PER_INCH, metadata={"Software": None})
-        figure.savefig(file.with_suffix(".svg"), metadata={"Date": None, "Creator": None})
-    return file.with_suffix(".png")
-
-
-def figure_of(width: float, height: float, rows: int = 1, columns: int = 1, **options: Any) -> tuple[Figure, Any]:
-    """A figure of that size in inches, and its axes [rows, columns]; no window is opened."""
-    from matplotlib.backends.backend_agg import FigureCanvasAgg
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(width, height), layout="constrained")
-    FigureCanvasAgg(figure)
-    return figure, figure.subplots(rows, columns, squeeze=False, **options)
 
 
 # ------------------------------------------------------------------------------ Figs 5 and 6

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import csv
 import dataclasses
-import json
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
@@ -24,14 +22,21 @@ from workbench.reproduce.conditions import (
     TAU_FRAMES,
 )
 from workbench.reproduce.correction import READINGS, SHIFT_NOISE_PX, TRUTHS, TURN_NOISE_RAD, Effect
+from workbench.reproduce.documents import (
+    Table,
+    markdown,
+    picture,
+    statement_lines,
+    version_lines,
+    write_csv,
+    write_json,
+)
 from workbench.reproduce.experiment import METHODS, Run
+from workbench.reproduce.judged import Statement
 from workbench.reproduce.matrix import PRESETS
 from workbench.reproduce.measures import Accuracy
-from workbench.reproduce.statements import END, RELATIVE, Statement, spread, statements
+from workbench.reproduce.statements import END, RELATIVE, spread, statements
 from workbench.session import versions
-from workbench.summary import without_nan
-
-Table = tuple[Sequence[str], list[tuple[str, ...]]]
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -192,8 +197,8 @@ VARIED = (
 def write(results: Results, folder: Path) -> Path:
     """Write report.md, its pictures, report.json and the CSV files; returns the report."""
     (folder / "pictures").mkdir(exist_ok=True)
-    _write_json(results, folder / "report.json")
-    _write_csv(results, folder / "experiment.csv")
+    write_json(values(results), folder / "report.json")
+    write_csv([_run_values(run, method) for run in results.runs for method in METHODS], folder / "experiment.csv")
     report = folder / "report.md"
     report.write_text("\n".join(_lines(results, folder)) + "\n", encoding="utf-8")
     return report
@@ -228,19 +233,6 @@ def _run_values(run: Run, method: str) -> dict[str, Any]:
     return names | dataclasses.asdict(run.accuracies[method])
 
 
-def _write_json(results: Results, file: Path) -> None:
-    file.write_text(json.dumps(without_nan(values(results)), indent=1, allow_nan=False) + "\n", encoding="utf-8")
-
-
-def _write_csv(results: Results, file: Path) -> None:
-    rows = [_run_values(run, method) for run in results.runs for method in METHODS]
-    if rows:
-        with file.open("w", encoding="utf-8", newline="") as stream:
-            writer = csv.DictWriter(stream, list(rows[0]), lineterminator="\n")
-            writer.writeheader()
-            writer.writerows(rows)
-
-
 def _lines(results: Results, folder: Path) -> Iterator[str]:
     yield "# Paper A, experiment 3.2, on simulated frames"
     yield from ("", f"`{results.command}`", "")
@@ -248,7 +240,7 @@ def _lines(results: Results, folder: Path) -> Iterator[str]:
         yield from (f"**Not finished**: {', '.join(results.unfinished)}. The same command goes on.", "")
     yield from _set_up(results)
     if results.runs:
-        yield from ("", "## What the numbers say", "", *_statement_lines(results.statements))
+        yield from ("", "## What the numbers say", "", *statement_lines(results.statements))
         yield from ("", "## The paper's quantities", "", *markdown(experiment_table(results)), "", *QUANTITIES)
         yield from ("", "Over the seeds, paper-a without correction: median (least … largest).", "")
         yield from markdown(scatter_table(results))
@@ -256,12 +248,12 @@ def _lines(results: Results, folder: Path) -> Iterator[str]:
     if results.effects:
         yield from ("", "## The correction, without images", "", *CORRECTION, "")
         yield from markdown(correction_table(results.effects))
-        yield from _picture(folder, "correction", lambda: pictures.correction(results.effects))
+        yield from picture(folder, "correction", lambda: pictures.correction(results.effects))
     if results.matrix:
         yield from _matrix_lines(results, folder)
     if results.limits:
         yield from _limits_lines(results, folder)
-    yield from ("", "## Versions", "", ", ".join(f"{name} {version}" for name, version in versions().items()))
+    yield from version_lines()
 
 
 def _set_up(results: Results) -> Iterator[str]:
@@ -294,11 +286,6 @@ CORRECTION = (
 )
 
 
-def _statement_lines(made: Sequence[Statement]) -> Iterator[str]:
-    for statement in made:
-        yield f"- **{statement.upshot}** — {statement.claim}. {statement.numbers}."
-
-
 def _run_pictures(results: Results, folder: Path) -> Iterator[str]:
     logged = {log.name for log in results.logs}
     for run in results.runs:
@@ -306,8 +293,8 @@ def _run_pictures(results: Results, folder: Path) -> Iterator[str]:
             continue
         name = run.cell.name
         yield from ("", f"## {name}: {run.cell.condition.meaning}")
-        yield from _picture(folder, f"fig5-{name}", partial(pictures.trajectories, run))
-        yield from _picture(folder, f"fig6-{name}", partial(pictures.errors, run))
+        yield from picture(folder, f"fig5-{name}", partial(pictures.trajectories, run))
+        yield from picture(folder, f"fig6-{name}", partial(pictures.errors, run))
         yield from ("", f"Logged: `workbench view {folder / f'log-{name}'}`")
 
 
@@ -317,7 +304,7 @@ def _matrix_lines(results: Results, folder: Path) -> Iterator[str]:
     yield from ("", "## Surfaces, speeds, trajectories", "")
     yield from (f"Drives of {', '.join(frames)} frames without disturbance, both presets.", "")
     yield from markdown(matrix_table(results.matrix))
-    yield from _picture(folder, "matrix", lambda: pictures.matrix(results.matrix, surfaces))
+    yield from picture(folder, "matrix", lambda: pictures.matrix(results.matrix, surfaces))
 
 
 def _limits_lines(results: Results, folder: Path) -> Iterator[str]:
@@ -330,7 +317,7 @@ def _limits_lines(results: Results, folder: Path) -> Iterator[str]:
     )
     for varied, table in limits_tables(results.limits).items():
         yield from ("", f"### By {varied}", "", *markdown(table))
-    yield from _picture(folder, "limits", lambda: pictures.limits(*_limits_maps(results.limits)))
+    yield from picture(folder, "limits", lambda: pictures.limits(*_limits_maps(results.limits)))
 
 
 def _limits_maps(found: Mapping[limits.Case, Mapping[int, float]]) -> tuple[Any, Any, list[str]]:
@@ -348,21 +335,6 @@ def _limits_maps(found: Mapping[limits.Case, Mapping[int, float]]) -> tuple[Any,
             smallest[surfaces.index(surface), names.index(value)] = math.inf if side is None else side
         needed[varied.name.partition(" (")[0]] = ([f"{name:g}" for name in names], smallest)
     return rates, needed, surfaces
-
-
-def _picture(folder: Path, name: str, draw: Any) -> Iterator[str]:
-    file = pictures.save(folder / "pictures" / name, draw)
-    yield from ("", f"![{name}]({file.relative_to(folder).as_posix()})")
-
-
-def markdown(table: Table) -> list[str]:
-    """A table as Markdown."""
-    heads, rows = table
-    return [_row(heads), _row(["---"] * len(heads)), *(_row(row) for row in rows)]
-
-
-def _row(cells: Sequence[str]) -> str:
-    return f"| {' | '.join(cells)} |"
 
 
 def _place(surfaces: Sequence[str], field: str, case: limits.Case) -> tuple[int, float]:

@@ -4,14 +4,13 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass
-from enum import StrEnum
 from typing import NamedTuple
 
 import numpy as np
 
 from workbench.reproduce.correction import READINGS, TRUTHS, Effect
 from workbench.reproduce.experiment import BEST, EXACT, PAPER, PRINTED, PRIOR
+from workbench.reproduce.judged import Statement, Upshot, worst
 from workbench.reproduce.measures import Accuracy
 
 RELATIVE = {"relative_x": ("X", 0.0647), "relative_y": ("Y", 0.0491), "relative_euclid": ("Euclid", 0.0569)}
@@ -24,24 +23,6 @@ CLEAR = 0.9
 
 Found = Mapping[str, Sequence[Mapping[str, Accuracy]]]
 """By condition, one mapping from method to accuracy for every seed."""
-
-
-class Upshot(StrEnum):
-    """What became of a claim."""
-
-    REACHED = "reached"
-    IN_SCATTER = "within its scatter"
-    """The median over the seeds misses the bar, the best seed reaches it."""
-    MISSED = "missed"
-
-
-@dataclass(frozen=True, slots=True)
-class Statement:
-    """A claim, what became of it, and the numbers that say so."""
-
-    claim: str
-    upshot: Upshot
-    numbers: str
 
 
 class Spread(NamedTuple):
@@ -68,12 +49,6 @@ def upshot(found: Spread, bar: float) -> Upshot:
     if found.median <= bar:
         return Upshot.REACHED
     return Upshot.IN_SCATTER if found.least <= bar else Upshot.MISSED
-
-
-def worst(upshots: Iterable[Upshot]) -> Upshot:
-    """The worst of some, of none the best."""
-    order = list(Upshot)
-    return max(upshots, key=order.index, default=Upshot.REACHED)
 
 
 def statements(found: Found, effects: Sequence[Effect]) -> list[Statement]:

@@ -1,0 +1,117 @@
+"""`workbench reproduce paper-b`: the paper's simulation and a replica of its robot's run, tables, pictures, report."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+from workbench import scenarios
+from workbench.reproduce.documents import made_folder
+from workbench.reproduce.ranging import report
+from workbench.reproduce.ranging import robot as replica
+from workbench.reproduce.ranging import simulation as sim
+from workbench.reproduce.ranging.parts import Part
+from workbench.reproduce.ranging.results import Results
+from workbench.reproduce.tasks import Task, carried_out
+from workbench.session import versions
+from workbench.settings import SettingsError
+
+OnProgress = Callable[[str, int, int], None]
+"""Told what is being done, how many steps of it are done, and how many there are."""
+RUNS, SEEDS = 4000, 40
+FEWEST_RUNS, FEWEST_SEEDS = 10, 1
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Plan:
+    """What is to be done: `runs` of each Monte Carlo, `seeds` runs of the robot."""
+
+    out: Path = Path("results/paper-b")
+    runs: int = RUNS
+    seeds: int = SEEDS
+    command: str = "workbench reproduce paper-b"
+
+
+@dataclass(frozen=True, slots=True)
+class Reproduced:
+    """What came of it: the folder, the report, the results, and whether it was interrupted."""
+
+    folder: Path
+    file: Path
+    results: Results
+    interrupted: bool
+
+
+@dataclass(frozen=True, slots=True)
+class Work:
+    """One part: what it is called, what makes it, how many ticks that takes, and what it depends on."""
+
+    name: str
+    kind: type[Part]
+    make: Task[Part]
+    ticks: int
+    depends: dict[str, Any]
+
+
+def works(plan: Plan) -> list[Work]:
+    """The parts of a plan."""
+    made = [
+        Work(name, kind, partial(make, plan.runs), ticks, {"runs": plan.runs})
+        for name, kind, make, ticks in (
+            ("accuracy", sim.Accuracy, sim.accuracy, 2 * len(sim.TABLE_2_PIXELS)),
+            ("convergence", sim.Convergence, sim.convergence, 16 * len(sim.CURVE_PIXELS)),
+            ("scaling", sim.Scaling, sim.scaling, 2 + 2 * len(sim.SCALE_SPEEDS_MPS)),
+            ("consistency", sim.Consistency, sim.consistency, len(sim.CONSISTENCY_PIXELS)),
+            ("better", sim.Better, sim.better, 2 * len(sim.CONSISTENCY_PIXELS) + 3),
+            ("misprints", sim.Misprints, sim.misprints, 9),
+            ("asynchronous", sim.Asynchronous, sim.asynchronous, 3 * len(sim.CONSISTENCY_PIXELS)),
+        )
+    ]
+    scenario = scenarios.load(replica.SCENARIO).scenario.model_dump(mode="json")
+    ticks = plan.seeds + min(plan.seeds, replica.WAYS_RUNS) + 2
+    depends = {"runs": plan.runs, "seeds": plan.seeds, "scenario": scenario}
+    made.append(Work("robot", replica.Robot, partial(replica.robot, plan.seeds, plan.runs), ticks, depends))
+    return made
+
+
+def reproduce(plan: Plan, on_progress: OnProgress) -> Reproduced:
+    """Do what is missing of the plan in its folder, and write the report.
+
+    Finished parts are found again, so that the same call goes on after an interrupt.
+
+    Raises:
+        WorkbenchError: the plan cannot be carried out; the text says why.
+    """
+    for name, value, least in (("runs", plan.runs, FEWEST_RUNS), ("seeds", plan.seeds, FEWEST_SEEDS)):
+        if value < least:
+            raise SettingsError(f"--{name} {value}: must be {least} or more")
+    made_folder(plan.out)
+    wanted, found, interrupted = works(plan), dict[str, Part](), False
+    try:
+        for work in wanted:
+            found[work.name] = _done(work, plan.out, on_progress)
+    except KeyboardInterrupt:
+        interrupted = True
+    results = Results(
+        command=plan.command,
+        runs=plan.runs,
+        seeds=plan.seeds,
+        unfinished=[work.name for work in wanted if work.name not in found],
+        **found,  # type: ignore[arg-type]
+    )
+    return Reproduced(plan.out, report.write(results, plan.out), results, interrupted)
+
+
+def _done(work: Work, folder: Path, on_progress: OnProgress) -> Part:
+    """The part, from the folder or made now."""
+    identity = json.dumps({"versions": versions(), **work.depends}, sort_keys=True, default=str)
+    kept = work.kind.kept(folder, identity)
+    if kept is not None:
+        return kept
+    (part,) = carried_out([work.make], jobs=1, on_tick=lambda done: on_progress(work.name, done, work.ticks))
+    part.keep(folder, identity)
+    return part
