@@ -121,6 +121,74 @@ def test_paper_b_goes_forth_and_back_before_the_chessboard() -> None:
     assert np.median(nearest) < 1.0  # the tracks have 0.5 px of noise, the corners are found to half a pixel
 
 
+def test_a_square_on_the_spot_turns_where_it_stands() -> None:
+    """Each round: 1 m at 0.5 m/s and 0.5 m/s² in 3 s, a stop of 0.5 s, a quarter turn in 2 s."""
+    mission = made("square-on-the-spot", "ground.size_px=256")
+    assert mission.motion.duration_s == pytest.approx(4 * 5.5)
+    ends = mission.motion.at(np.arange(9) // 2 * 5.5 + np.array([0, 3.25] * 4 + [0])).poses
+    corners = np.array([[0, 0], [1, 0], [1, 0], [1, 1], [1, 1], [0, 1], [0, 1], [0, 0], [0, 0]])
+    np.testing.assert_allclose(ends[:, :2], corners, atol=1e-9)
+    np.testing.assert_allclose(ends[:, 2], np.array([0, 0, 1, 1, 2, 2, 3, 3, 4]) * np.pi / 2, atol=1e-9)
+    turning = mission.motion.at(np.linspace(3.01, 5.49, 50))
+    np.testing.assert_allclose(turning.velocity_mps, 0, atol=1e-12)
+    assert turning.angular_velocity_radps[:, 2].max() == pytest.approx(1.875 * np.pi / 2 / 2, rel=0.01)
+
+
+def test_legs_go_back_in_reverse_and_along_curves() -> None:
+    legs = "trajectory.legs=[{drive_m=1, curve='circle', parameters={radius_m=0.5}}, {drive_m=-0.5}]"
+    mission = small("line", legs, "trajectory.speed_kmh=1.8")
+    end = mission.motion.at(np.array([mission.motion.duration_s]))
+    corner = np.array([0.5 * np.sin(2), 0.5 - 0.5 * np.cos(2)])  # after 1 m of a circle of 0.5 m: 2 rad
+    np.testing.assert_allclose(end.poses[0, :2], corner - 0.5 * np.array([np.cos(2), np.sin(2)]), atol=1e-9)
+    assert end.heading_rad[0] == pytest.approx(2)
+
+
+def test_sideslip_wavers_about_its_mean() -> None:
+    steady = ("duration_s=60", "trajectory.profile=constant", "trajectory.sideslip_rad=0.1")
+    motion = small("sideslip", *steady).motion
+    velocity = motion.at(np.linspace(0, 60, 3000)).body_velocity_mps
+    slip = np.arctan2(velocity[:, 1], velocity[:, 0])
+    assert (slip.mean(), slip.std()) == pytest.approx((0.1, 0.05), abs=0.01)
+    other = small("sideslip", *steady, seed=4).motion.at(np.linspace(0, 60, 3000)).body_velocity_mps
+    assert np.abs(np.corrcoef(velocity[:, 1], other[:, 1])[0, 1]) < 0.5
+
+
+def test_cameras_say_where_they_sit_unless_a_gimbal_moves_them() -> None:
+    place = ("camera.ahead_m=0.1", "camera.left_m=-0.02", "camera.pitch_rad=-0.3")
+    mission = small("circle", *place, "body.roll_rms_rad=0.05")
+    camera, state = mission.on_board[0], mission.motion.at(np.array([1.3]))
+    world_r_camera, position = camera.mount.world_t_camera(state)
+    body_t_camera = mission.cameras[IMAGE].body_t_camera
+    np.testing.assert_allclose(state.world_r_body[0] @ body_t_camera[:3, :3], world_r_camera[0], atol=1e-12)
+    seen = state.position_m[0] + state.world_r_body[0] @ body_t_camera[:3, 3]
+    np.testing.assert_allclose(seen, position[0], atol=1e-12)
+    np.testing.assert_array_equal(body_t_camera[3], [0, 0, 0, 1])
+    assert np.isnan(small("gimballed").cameras[IMAGE].body_t_camera).all()
+
+
+def test_the_reference_of_a_camera_is_no_pose_of_the_bodys_frame() -> None:
+    def frames(*overrides: str) -> set[str]:
+        poses = small("circle", "frames=3", *overrides).read(["/reference/pose"])
+        return {s.child_frame for s in poses if isinstance(s, PoseSample)}
+
+    assert frames() == {"camera_ground"}
+    assert frames("reference.child_frame=prism") == {"prism"}
+    assert frames("camera=none", "height=none", "frames=none", "duration_s=0.1") == {"base_link"}
+
+
+def test_tracks_are_of_the_missions_landmarks() -> None:
+    mission = made("paper-b", "ground.size_px=256", "tracks.noise_px=0")
+    assert sorted(mission.landmarks) == list(range(4 + 48))
+    track = next(s for s in mission.read(["/front/tracks"]) if isinstance(s, TrackSample))
+    camera = mission.on_board[0]
+    state = mission.motion.at(np.array([(track.t_ns - mission.start_ns) * 1e-9]))
+    world_r_camera, position = camera.mount.world_t_camera(state)
+    for number, point in zip(track.ids.tolist(), track.points_px, strict=True):
+        ray = world_r_camera[0].T @ (mission.landmarks[number].position_m - position[0])
+        pixel = camera.camera.matrix @ ray
+        np.testing.assert_allclose(point, pixel[:2] / pixel[2], atol=1e-4)
+
+
 # ------------------------------------------------------------------------------ determinism
 
 
@@ -232,6 +300,10 @@ def test_every_key_is_described() -> None:
         ('faults=[{kind="gyro-bias", start_s=1, stop_s=2, bias_radps=[0,0,1]}]', "gyro-bias needs a section imu"),
         ('faults=[{kind="track-outliers", start_s=1, stop_s=2}]', "track-outliers needs a section tracks"),
         ("camera=none", "height: it is the downward camera's; add a section camera"),
+        ("trajectory.legs=[{drive_m=1, turn_rad=1}]", "a leg has one of drive_m, turn_rad and stop_s, here: drive_m, "),
+        ("trajectory.legs=[{speed=1}]", "unknown setting 'trajectory.legs.0.speed'"),
+        ("trajectory={legs=[{stop_s=1}], stops=[[1, 2]]}", "leave stops and sideslip_rms_rad out"),
+        ("trajectory={legs=[{stop_s=1}], speed_kmh=-1}", "legs are driven at a positive speed_kmh"),
         ("tracks.noise_px=1", "tracks: they need a section front, and landmarks_m or a chessboard"),
     ],
 )
