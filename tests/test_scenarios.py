@@ -297,6 +297,10 @@ def test_every_key_is_described() -> None:
         ("faults.1.gain=1", "faults has 1 entries, and the first one is faults.0"),
         ("faults.0.stop_s=2", "exposure-jump: from 3.0 to 2.0 s: 0 <= start_s < stop_s is needed"),
         ("faults=[5]", "a fault is a table such as"),
+        ("faults.0.stop_s=inf", "exposure-jump: stop_s is inf, it must be a finite number"),
+        ("faults.0.gain=-1", "exposure-jump: gain is -1.0, it must be 0 or more"),
+        ("camera.timing.clock_offset_s=1e10", "clock_offset_s is 10000000000.0, it must be within ±1e9"),
+        ("start_ns=99999999999999999999", "start_ns = 99999999999999999999: input should be less than or equal to"),
         ('faults=[{kind="gyro-bias", start_s=1, stop_s=2, bias_radps=[0,0,1]}]', "gyro-bias needs a section imu"),
         ('faults=[{kind="track-outliers", start_s=1, stop_s=2}]', "track-outliers needs a section tracks"),
         ("camera=none", "height: it is the downward camera's; add a section camera"),
@@ -331,12 +335,45 @@ def test_a_wrong_value_is_named_with_its_cure(override: str, text: str) -> None:
             "the way does not lead over it",
         ),
         ("surroundings.landmarks_m=[[3,0,0.1]]", "surroundings: plane 0 reaches"),
+        ("camera.distortion=[-5]", "camera: no ray of the plumb_bob model leads to pixel"),
+        ("body.roll_rms_rad=3", "camera: it is at a height of -0.2"),
+        ("trajectory.legs=[{drive_m=0}]", "trajectory: 0.0 m at 0.5.* m/s: there is no such speed profile"),
     ],
 )
 def test_what_cannot_be_built_names_the_section(override: str, text: str) -> None:
     loaded = scenarios.load("fault-exposure-jump", overrides=["ground.size_px=256", override])
     with pytest.raises((SettingsError, RecordingError), match=text):
         scenarios.mission(loaded)
+
+
+@pytest.mark.parametrize(
+    ("kind", "values", "text"),
+    [
+        ("motion-blur", "exposure=1.5", "exposure is 1.5, it must be a share within 0 and 1"),
+        ("motion-blur", "exposure=0.5, samples=0", "samples is 0, it must be a whole number above 0"),
+        ("image-noise", "noise_grey=-3", "noise_grey is -3.0, it must be 0 or more"),
+        ("lens-dirt", "share=3", "share is 3.0, it must be a share within 0 and 1"),
+        ("late-images", "latency_s=nan", "latency_s is nan, it must be a finite number"),
+        ("wrong-calibration", "focal_factor=0", "focal_factor is 0.0, it must be above 0"),
+        ("low-texture", "margin_m=-1", "margin_m is -1.0, it must be 0 or more"),
+        ("repetitive-texture", "period_px=5", "period_px is 5, it must be an even number above 0"),
+        ("track-outliers", "size_px=-3", "size_px is -3.0, it must be 0 or more"),
+    ],
+)
+def test_a_fault_that_cannot_be_is_named(kind: str, values: str, text: str) -> None:
+    with pytest.raises(SettingsError) as caught:
+        scenarios.load("sensors", overrides=[f'faults=[{{kind="{kind}", start_s=1, stop_s=2, {values}}}]'])
+    assert f"{kind}: {text}" in str(caught.value)
+
+
+def test_part_of_a_timing_leaves_the_rest_as_usual() -> None:
+    parts = ("camera.timing.latency_s=0.1", "imu={timing={latency_s=0.2}}", "front.timing.drop_share=0.5")
+    scenario = scenarios.load("line", overrides=parts).scenario
+    assert scenario.camera is not None
+    assert scenario.front is not None
+    assert scenario.imu is not None
+    timings = [section.timing for section in (scenario.camera, scenario.imu, scenario.front)]
+    assert [(t.rate_hz, t.latency_s, t.drop_share) for t in timings] == [(60, 0.1, 0), (100, 0.2, 0), (5, 0, 0.5)]
 
 
 def test_files_that_are_no_scenario(tmp_path: Path) -> None:

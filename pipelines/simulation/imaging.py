@@ -7,7 +7,6 @@ are `timing.schedule`'s.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -32,7 +31,7 @@ from pipelines.simulation.motion import Motion, Mount
 from pipelines.simulation.render import behind_dirt, expose, noise_key_of, view
 from pipelines.simulation.scene import Scene
 from pipelines.simulation.timing import Schedule
-from readers.streams import Camera, ImageSample, StreamKind
+from readers.streams import Camera, ImageError, ImageSample, StreamKind
 
 Floats = NDArray[np.float64]
 
@@ -163,13 +162,18 @@ class CameraOnBoard:
             t_ns=t_ns,
             received_ns=received_ns,
             encoding="mono8",
-            payload=partial(_bytes, self.picture, number),
+            payload=partial(self._bytes, number),
             width_px=self.camera.width_px,
             height_px=self.camera.height_px,
             step_bytes=self.camera.width_px,
-            source=f"{self.name} {self.stream} frame {number}",
+            source=self._source(number),
         )
 
+    def _bytes(self, number: int) -> memoryview:
+        try:
+            return self.picture(number).data.cast("B")
+        except ValueError as error:
+            raise ImageError(f"{self._source(number)}: {error}") from error
 
-def _bytes(picture: Callable[[int], NDArray[np.uint8]], number: int) -> memoryview:
-    return picture(number).data.cast("B")
+    def _source(self, number: int) -> str:
+        return f"{self.name} {self.stream} frame {number}"

@@ -20,7 +20,7 @@ import scipy.ndimage
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from pipelines.lens import pinhole
+from pipelines.lens import pinhole, rays
 from pipelines.simulation import faults as flaws
 from pipelines.simulation.channels import Channel, rng_of
 from pipelines.simulation.curves import curve
@@ -30,7 +30,7 @@ from pipelines.simulation.faults import Fault
 from pipelines.simulation.imaging import OF_IMAGES, CameraOnBoard
 from pipelines.simulation.mission import IMAGE, INFO, LEVEL_FRAME, START_NS, SimulatedMission, digest
 from pipelines.simulation.motion import FORWARD, NADIR, Kinematics, Motion, Mount, looking
-from pipelines.simulation.patches import OF_GROUND, faults_met, patches_of
+from pipelines.simulation.patches import OF_GROUND, faults_met, outline, patches_of
 from pipelines.simulation.scene import Plane, Relief, Scene, chessboard, chessboard_corners, poster, upright
 from pipelines.simulation.sections import (
     AnyFault,
@@ -88,7 +88,7 @@ class Scenario(Section):
     seed: int = Field(0, ge=0, description="seed of everything random")
     duration_s: Positive | None = Field(None, description="length; None: that of the speed profile, or 8 s")
     frames: Count | None = Field(None, description="length in frames of the first camera; overrides duration_s")
-    start_ns: int = Field(START_NS, ge=0, description="time of the start, ns since 1970")
+    start_ns: int = Field(START_NS, ge=0, le=1 << 62, description="time of the start, ns since 1970")
     ground: Ground = Field(Ground(), description="the ground")
     trajectory: Trajectory = Field(Trajectory(), description="the way and the speed")
     body: Fluctuation = Field(Fluctuation(), description="how the body sways")
@@ -360,10 +360,12 @@ def height_of(relief: Relief, x_m: Floats, y_m: Floats) -> Floats:
 
 def _scene(scenario: Scenario, faults: Sequence[Fault], picture: ArrayLike | None) -> Scene:
     surface, around = _surface(scenario, picture), scenario.surroundings
+    with _named("faults"):
+        patches = patches_of(faults, surface, scenario.seed)
     with _named("surroundings"):
         return Scene(
             surface,
-            patches=patches_of(faults, surface, scenario.seed),
+            patches=patches,
             relief=_relief(scenario),
             planes=tuple(_planes(around, scenario.seed)),
             background_grey=around.background_grey,
@@ -407,7 +409,8 @@ def _camera(
     own_seed = int(rng_of(scenario.seed, post.images).integers(1 << 62))
     with _named(post.section):
         camera, mount = _truly(section, post)
-        return CameraOnBoard(
+        rays(camera, outline(camera))
+        on_board = CameraOnBoard(
             stream=post.images,
             start_ns=scenario.start_ns,
             camera=camera,
@@ -431,6 +434,10 @@ def _camera(
             faults=faults,
             name=scenario.name,
         )
+        lowest = float(on_board.heights_m.min())
+        if lowest <= 0:
+            raise ValueError(f"it is at a height of {lowest:g} m at times: mount it higher, or let the body sway less")
+        return on_board
 
 
 # ---- everything else on board

@@ -10,7 +10,7 @@ import dataclasses
 import difflib
 import re
 from collections.abc import Mapping
-from typing import Annotated, Any, Literal, get_type_hints
+from typing import Annotated, Any, Literal
 
 from pydantic import (
     BaseModel,
@@ -21,6 +21,7 @@ from pydantic import (
     PlainValidator,
     TypeAdapter,
     ValidationError,
+    field_validator,
     model_validator,
 )
 
@@ -56,21 +57,23 @@ def hint(wrong: str, known: list[str]) -> str:
     return f"did you mean {' or '.join(near)}?" if near else f"known are: {', '.join(known)}"
 
 
-def _without_unknown_keys(kind: type, values: Any) -> Any:
-    """Refuse keys that a dataclass, or a dataclass within it, does not have."""
+def _completed(kind: type, values: Any) -> Any:
+    """The keys of a dataclass, those of a dataclass within it laid over its default; unknown ones are refused."""
     if not isinstance(values, Mapping):
         return values
-    types = get_type_hints(kind)
+    fields = {field.name: field for field in dataclasses.fields(kind)}
+    completed = dict(values)
     for key, value in values.items():
-        if key not in types:
-            raise ValueError(f"unknown key {key!r}; {hint(str(key), list(types))}")
-        if dataclasses.is_dataclass(types[key]) and isinstance(types[key], type):
-            _without_unknown_keys(types[key], value)
-    return values
+        if key not in fields:
+            raise ValueError(f"unknown key {key!r}; {hint(str(key), list(fields))}")
+        usual = fields[key].default
+        if dataclasses.is_dataclass(usual) and not isinstance(usual, type) and isinstance(value, Mapping):
+            completed[key] = _completed(type(usual), dataclasses.asdict(usual) | dict(value))
+    return completed
 
 
 def _known(kind: type) -> BeforeValidator:
-    return BeforeValidator(lambda values: _without_unknown_keys(kind, values))
+    return BeforeValidator(lambda values: _completed(kind, values))
 
 
 Clock = Annotated[Timing, _known(Timing)]
@@ -94,9 +97,11 @@ def fault_of(values: Any) -> Fault:
         raise ValueError(f"no fault is named {name!r}; {hint(str(name), list(FAULTS))}")
     kind = FAULTS[name]
     try:
-        fault = TypeAdapter(kind).validate_python(_without_unknown_keys(kind, parameters))
+        fault = TypeAdapter(kind).validate_python(_completed(kind, parameters))
     except ValidationError as error:
         first = error.errors()[0]
+        if first["type"] == "value_error":
+            raise ValueError(f"{name}: {str(first['ctx']['error']).partition(': ')[2]}") from None
         raise ValueError(f"{name}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
@@ -212,6 +217,12 @@ class CameraSection(Section):
     vignetting: Share = Field(0.0, description="fall of brightness in the image corners")
     exposure_s: NotNegative = Field(0.0, description="how long the shutter is open")
     readout_s: NotNegative = Field(0.0, description="rolling shutter: from the first row to the last")
+
+    @field_validator("timing", mode="before")
+    @classmethod
+    def _over_the_usual_timing(cls, values: Any) -> Any:
+        usual = dataclasses.asdict(cls.model_fields["timing"].default)
+        return usual | dict(values) if isinstance(values, Mapping) else values
 
 
 class DownCamera(CameraSection):
