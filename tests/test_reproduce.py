@@ -379,11 +379,11 @@ def test_matrix_is_filled_once_and_goes_on(tmp_path: Path) -> None:
     wanted = matrix.places(["gravel"], speeds_kmh=(2.0,), trajectories=("line", "circle"), frames=20)
     results = matrix.ledger(tmp_path)
     with pytest.raises(KeyboardInterrupt):
-        matrix.fill(wanted, results, jobs=1, on_tick=lambda done: stop_at(done, 30))
-    assert matrix.missing_of(wanted, results) == wanted[1:]
+        results.fill(wanted, jobs=1, on_tick=lambda done: stop_at(done, 30))
+    assert results.missing_of(wanted) == wanted[1:]
     results = matrix.ledger(tmp_path)
     ticks: list[int] = []
-    matrix.fill(wanted, results, jobs=1, on_tick=ticks.append)
+    results.fill(wanted, jobs=1, on_tick=ticks.append)
     assert len(ticks) == 20
     rows = list(matrix.rows_of(wanted, results))
     assert [(r["trajectory"], r["preset"]) for r in rows] == [
@@ -394,7 +394,7 @@ def test_matrix_is_filled_once_and_goes_on(tmp_path: Path) -> None:
     assert len(lines) == 1
     assert len(lines[0]) == len(heads)
     changed = [dataclasses.replace(place, overrides=("fragment_side_px=21",)) for place in wanted]
-    assert matrix.missing_of(changed, results) == changed
+    assert results.missing_of(changed) == changed
     assert drawn.save(tmp_path / "matrix", lambda: drawn.matrix(rows, ["gravel"])).stat().st_size > 10_000
 
 
@@ -407,14 +407,14 @@ def test_limits_count_false_peaks(tmp_path: Path) -> None:
     easy = limits.Case(surface="gravel", samples=24, noise_grey=0.0, rotation_deg=0.0)
     hard = limits.Case(surface="gravel", samples=24, noise_grey=40.0)
     results = limits.ledger(tmp_path)
-    limits.fill([easy, hard], results, jobs=1, on_tick=lambda _: None)
+    results.fill([easy, hard], jobs=1, on_tick=lambda _: None)
     assert set(limits.false_rates(easy, results)) == set(limits.SIDES_PX)
     assert max(limits.false_rates(easy, results).values()) == 0
     assert limits.smallest_side(limits.false_rates(easy, results)) == 5
     rates = limits.false_rates(hard, results)
     assert rates[5] > 0.7
     assert rates[5] > rates[31]
-    assert limits.missing_of([easy, hard], limits.ledger(tmp_path)) == []
+    assert limits.ledger(tmp_path).missing_of([easy, hard]) == []
     assert limits.smallest_side({5: 0.5, 9: 0.01, 21: 0.0}) == 9
     assert limits.smallest_side({5: 0.5, 9: 0.02}) is None
 
