@@ -3,19 +3,26 @@
 import json
 from collections import Counter
 from pathlib import Path
+from typing import Any
 
 import cv2
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 
 from pipelines.correlation.step import CorrelationStep
 from pipelines.geometry import heading_of_quat
 from pipelines.simulation import scenario as making
+from pipelines.simulation.families import ground
 from pipelines.simulation.faults import FAULTS, FAULTS_STREAM, from_text, to_text
 from pipelines.simulation.mission import IMAGE, SimulatedMission
+from pipelines.simulation.motion import NADIR, Hold, looking
+from pipelines.simulation.scenario import landmarks_of
 from pipelines.simulation.scene import Relief
 from pipelines.simulation.sections import is_section, meanings
+from pipelines.simulation.surfaces import surface_from_image
 from readers.streams import (
+    CameraInfo,
     ImageSample,
     ImuSample,
     OdometrySample,
@@ -387,6 +394,127 @@ def test_files_that_are_no_scenario(tmp_path: Path) -> None:
     (tmp_path / "odd.toml").write_text("camra.noise_grey = 1")
     with pytest.raises(SettingsError, match=r"odd.toml: unknown setting 'camra'; did you mean camera\?"):
         scenarios.load(str(tmp_path / "odd.toml"))
+
+
+# ------------------------------------------------------------------- every key reaches its part
+
+
+def test_the_keys_of_a_camera_are_those_of_the_camera_on_board() -> None:
+    keys = {"exposure_s": 0.004, "readout_s": 0.01, "noise_grey": 1.5, "vignetting": 0.3}
+    place = {"ahead_m": 0.1, "left_m": -0.02, "height_m": 0.25}
+    turn = {"yaw_rad": 0.1, "pitch_rad": -0.2, "roll_rad": 0.05}
+    words = [f"camera.{key}={value}" for key, value in (keys | place | turn).items()]
+    camera = small("line", "frames=3", "camera.hold=levelled", "camera.distortion=[-0.1]", *words).on_board[0]
+    assert {key: getattr(camera, key) for key in keys} == keys
+    np.testing.assert_array_equal(camera.mount.position_m, list(place.values()))
+    np.testing.assert_allclose(camera.mount.body_r_camera, looking(NADIR, **turn), atol=1e-15)
+    assert camera.mount.hold is Hold.LEVELLED
+    np.testing.assert_array_equal(camera.camera.distortion, [-0.1, 0, 0, 0, 0])
+
+
+def test_the_keys_of_the_ground_are_those_of_its_family() -> None:
+    keys = {"contrast": 3.0, "repetition": 0.5, "spectrum": 1.5, "metres_per_px": 0.001}
+    words = [f"ground.{key}={value}" for key, value in keys.items()]
+    expected = ground("sand", seed=7, size_px=512, scatter=False, **keys)
+    scenario = ("frames=2", "ground.family=sand", "ground.arrange=mirror", *words)
+    found = made("line", "ground.size_px=512", *scenario, seed=7).on_board[0].scene.ground
+    assert found is not None
+    np.testing.assert_array_equal(found.coefficients, expected.coefficients)
+    assert (found.scatter, found.metres_per_px) == (expected.scatter, 0.001)
+    for key in keys:
+        without = [word for word in words if key not in word]
+        other = made("line", "ground.size_px=512", *scenario[:3], *without, seed=7).on_board[0].scene.ground
+        assert other is not None
+        assert other.metres_per_px != 0.001 or not np.array_equal(other.coefficients, expected.coefficients), key
+
+
+def test_the_keys_of_a_picture_are_those_of_its_surface() -> None:
+    picture = np.random.default_rng(0).uniform(60, 200, (96, 128))
+    keys = ("ground.picture=a.png", "ground.psf_sigma_px=0.9", "ground.arrange=mirror", "ground.metres_per_px=0.002")
+    scenario = scenarios.load("line", overrides=("frames=2", *keys), seed=3).scenario
+    found = making.build(scenario, picture=picture).on_board[0].scene.ground
+    expected = surface_from_image(picture, metres_per_px=0.002, psf_sigma_px=0.9, arrange="mirror", seed=3)
+    assert found is not None
+    np.testing.assert_array_equal(found.coefficients, expected.coefficients)
+    assert (found.scatter, found.metres_per_px) == (expected.scatter, expected.metres_per_px)
+
+
+def test_the_body_sways_as_it_is_told() -> None:
+    rms = ("body.height_rms_m=0.01", "body.roll_rms_rad=0.02", "body.pitch_rms_rad=0.03")
+    means = ("body.roll_rad=0.1", "body.pitch_rad=-0.2")
+    state = small("line", "duration_s=200", *rms, *means).motion.at(np.linspace(0, 200, 4000))
+    heading, pitch, roll = Rotation.from_matrix(state.world_r_body).as_euler("ZYX").T
+    assert (state.position_m[:, 2].mean(), roll.mean(), pitch.mean()) == pytest.approx((0, 0.1, -0.2), abs=3e-3)
+    assert (state.position_m[:, 2].std(), roll.std(), pitch.std()) == pytest.approx((0.01, 0.02, 0.03), rel=0.15)
+    np.testing.assert_allclose(heading, 0, atol=1e-9)
+    assert np.abs(np.corrcoef([state.position_m[:, 2], roll, pitch]) - np.eye(3)).max() < 0.2
+    quick = small("line", "duration_s=200", *rms, "body.roll_tau_s=0.05").motion.at(np.linspace(0, 200, 4000))
+    assert quick.angular_velocity_radps[:, 0].std() > 3 * state.angular_velocity_radps[:, 0].std()
+
+
+def test_the_vehicle_stops_as_it_is_told() -> None:
+    stops = ("trajectory.stops=[[2, 1]]", "trajectory.stop_ramp_s=0.25", "trajectory.profile=constant")
+    motion = small("line", *stops).motion
+    speed = np.linalg.norm(motion.at(np.array([1.7, 1.9, 2.0, 2.9, 3.1, 3.3])).velocity_mps, axis=1)
+    assert speed == pytest.approx(np.array([1, 0.4, 0, 0, 0.4, 1]) * 0.4 / 3.6)
+
+
+def test_what_stands_around_is_what_is_seen() -> None:
+    base = ("frames=1", "camera=none", "height=none", "reference=none", "ground.size_px=256", "front.noise_grey=0")
+    board = "surroundings.chessboard={position_m=[4,0,0.8], facing_rad=2.8}"
+    places = "surroundings.landmarks_m=[[3.0, 0.8, 0.6], [3.0, -0.8, 0.6]]"
+    bare = made("line", *base, "surroundings.background_grey=90").frame(0)
+    assert bare[:150].tolist() == [[90] * 640] * 150
+    plain = made("line", *base, places, "surroundings.poster_m=0").frame(0)
+    posters = made("line", *base, places, "surroundings.poster_m=0.4").frame(0).astype(float)
+    changed = np.abs(posters - plain) > 0
+    assert np.flatnonzero(changed.any(axis=0)).min() == pytest.approx(319.5 - 500 * (0.8 + 0.2) / 3, abs=3)
+    left, right = (posters[200:280, c - 33 : c + 34] for c in (186, 453))
+    assert np.abs(left - right).mean() > 5  # no poster looks like another
+    corners = landmarks_of(scenarios.load("line", overrides=(*base, board)).scenario.surroundings)
+    across = corners[7] - corners[0]
+    assert across / np.linalg.norm(across) == pytest.approx([-np.sin(2.8), np.cos(2.8), 0], abs=1e-12)
+
+
+def test_every_sensor_is_told_the_start_and_the_seed() -> None:
+    moved = small("sensors", *BRIEF, "start_ns=1234567890123456789", seed=5)
+    usual, other = small("sensors", *BRIEF, seed=5), small("sensors", *BRIEF, seed=6)
+    by_stream = [_first_samples(mission) for mission in (moved, usual, other)]
+    for stream, sample in by_stream[1].items():
+        shift = moved.start_ns - usual.start_ns
+        assert by_stream[0][stream].t_ns - sample.t_ns == shift, stream
+        assert by_stream[0][stream].received_ns - sample.received_ns == shift, stream
+    for stream, value in (("/gnss/fix", "altitude_m"), ("/camera/height", "range_m")):
+        ours, same, theirs = (getattr(found[stream], value) for found in (by_stream[1], by_stream[0], by_stream[2]))
+        assert ours == same != theirs
+    assert np.any(by_stream[1]["/reference/pose"].position_m != by_stream[2]["/reference/pose"].position_m)
+    assert {"/camera/camera_info", "/front/camera_info"} <= set(by_stream[1])
+
+
+def _first_samples(mission: SimulatedMission) -> dict[str, Any]:
+    first: dict[str, Any] = {}
+    for sample in mission.read():
+        first.setdefault(sample.stream, sample)
+    return first
+
+
+def test_a_rolling_shutter_is_seen_while_the_vehicle_turns() -> None:
+    keys = ("frames=30", "trajectory.profile=constant", "trajectory.speed_kmh=4", "camera.noise_grey=0")
+    still, rolling = small("circle", *keys), small("circle", *keys, "camera.readout_s=0.02")
+    middle, top = (np.abs(rolling.frame(9)[r].astype(int) - still.frame(9)[r]).mean() for r in (36, 0))
+    assert top > 3 * middle + 1
+
+
+def test_faults_of_images_act_on_the_front_camera_too() -> None:
+    keys = ("duration_s=1", "camera=none", "height=none", "ground.size_px=256", "front.noise_grey=0")
+    fault = 'faults=[{kind="dropped-frames", start_s=0.2, stop_s=0.6}]'
+    images = [s.t_ns for s in made("line", *keys, fault).read(["/front/image_raw"])]
+    assert [round((t - making.START_NS) * 1e-9, 3) for t in images] == [0, 0.6, 0.8, 1.0]
+    wrong = 'faults=[{kind="wrong-calibration", start_s=0.2, stop_s=0.6, focal_factor=1.1}]'
+    infos = made("line", *keys, wrong).read(["/front/camera_info"])
+    assert [s.camera.matrix[0, 0] for s in infos if isinstance(s, CameraInfo)] == pytest.approx(
+        [500, 550, 550, 500, 500, 500]
+    )
 
 
 # ------------------------------------------------------------------------- ground and relief
