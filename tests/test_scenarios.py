@@ -94,9 +94,19 @@ def _the_reference_is_the_truth(mission: SimulatedMission) -> None:
 def test_there_is_a_scenario_for_every_fault_and_curve_of_the_paper() -> None:
     names = scenarios.names()
     assert {f"fault-{kind}" for kind in FAULTS} <= set(names)
-    assert {"paper-a", "paper-b", "demo", "line", "circle", "square", "figure-eight", "s-curve", "patrol-lanes"} <= set(
-        names
-    )
+    assert {
+        "paper-a",
+        "paper-b",
+        "demo",
+        "line",
+        "circle",
+        "square",
+        "figure-eight",
+        "s-curve",
+        "patrol-lanes",
+        "intersecting",
+        "non-intersecting",
+    } <= set(names)
 
 
 def test_paper_a_is_the_papers_experiment() -> None:
@@ -169,6 +179,9 @@ def test_cameras_say_where_they_sit_unless_a_gimbal_moves_them() -> None:
     np.testing.assert_allclose(state.world_r_body[0] @ body_t_camera[:3, :3], world_r_camera[0], atol=1e-12)
     seen = state.position_m[0] + state.world_r_body[0] @ body_t_camera[:3, 3]
     np.testing.assert_allclose(seen, position[0], atol=1e-12)
+    (told,) = mission.read(["/reference/pose"], mission.start_ns + 1_300_000_000, mission.start_ns + 1_300_000_001)
+    assert isinstance(told, PoseSample)
+    np.testing.assert_allclose(told.position_m, position[0], atol=1e-12)
     np.testing.assert_array_equal(body_t_camera[3], [0, 0, 0, 1])
     assert np.isnan(small("gimballed").cameras[IMAGE].body_t_camera).all()
 
