@@ -127,7 +127,7 @@ def waves() -> Surface:
 
 @functools.cache
 def stones() -> Surface:
-    return gravel(512, np.random.default_rng(4))
+    return gravel(256, np.random.default_rng(4))
 
 
 def still(x: float = 0.0, y: float = 0.0, heading: float = 0.0, **tilt: float) -> Waypoints:

@@ -5,6 +5,9 @@ import dataclasses
 import json
 import os
 import signal
+import subprocess
+import sys
+from collections import Counter
 from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
@@ -17,6 +20,7 @@ from evo.tools import file_interface
 from mcap.reader import make_reader
 from mcap_ros2.decoder import DecoderFactory
 from recordings_dir import RECORDINGS
+from rerun.chunk import RrdReader
 from rosbags.highlevel import AnyReader
 from rosbags.rosbag1 import Reader as Ros1Reader
 from rosbags.rosbag2 import Reader as Ros2Reader
@@ -26,7 +30,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines.simulation import faults
 from pipelines.simulation import trajectories as ways
-from pipelines.simulation.mission import POSE, SimulatedMission, nadir_camera, nadir_mission
+from pipelines.simulation.mission import IMAGE, POSE, SimulatedMission, nadir_camera, nadir_mission
 from pipelines.simulation.surfaces import tiles
 from readers import ReadOptions, open_recording
 from readers.streams import (
@@ -476,6 +480,7 @@ def test_euroc_rows_with_unknown_numbers_are_counted(tmp_path: Path) -> None:
         ({"distortion": array(-0.28, 0.07, 1e-4, 2e-4, 0)}, "plumb_bob", 4),
         ({"distortion_model": "equidistant", "distortion": array(1, 2, 3, 4)}, "equidistant", 4),
         ({"distortion_model": "none", "distortion": array()}, "none", 0),
+        ({"body_t_camera": np.vstack([np.arange(12.0).reshape(3, 4) / 7, [0, 0, 0, 1]])}, "plumb_bob", 5),
     ],
 )
 def test_euroc_keeps_the_calibration(tmp_path: Path, changes: dict[str, Any], model: str, count: int) -> None:
@@ -491,6 +496,7 @@ def test_euroc_keeps_the_calibration(tmp_path: Path, changes: dict[str, Any], mo
     sent = camera(**changes)
     np.testing.assert_array_equal(found.matrix, sent.matrix)
     np.testing.assert_array_equal(found.distortion, sent.distortion[:count])
+    np.testing.assert_array_equal(found.body_t_camera, sent.body_t_camera)
     assert (found.distortion_model, found.width_px, found.height_px) == (model, 16, 12)
     settings = YAML(typ="safe").load(tmp_path / "V0" / "mav0" / "cam0" / "sensor.yaml")
     assert settings["comment"] == "/cam/image_raw"
@@ -847,6 +853,35 @@ def check_ros(found: dict[str, list], image: Callable[[int], np.ndarray]) -> Non
         nanoseconds = stamp.nanosec if hasattr(stamp, "nanosec") else stamp.nsecs
         assert stamp.sec * 10**9 + nanoseconds == sent["/height"].t_ns
     assert found["/truth/faults"][0].data == FAULTS
+
+
+@pytest.mark.parametrize("container", ["mcap", "mcap-json"])
+def test_rerun_opens_the_logs(tmp_path: Path, container: str, mission: SimulatedMission) -> None:
+    log, converted = tmp_path / "m.mcap", tmp_path / "m.rrd"
+    write(mission, log, container=container, image_format="png")
+    checked = rerun("mcap", "check", str(log))
+    assert [line.split()[0] for line in checked.splitlines() if " /" in line] == ["ok"] * len(mission.streams)
+    assert f"Messages {sum(info.count for info in mission.streams)}" in " ".join(
+        rerun("mcap", "info", str(log)).split()
+    )
+    rerun("mcap", "convert", str(log), "-o", str(converted))
+    rows: Counter[str] = Counter()
+    shown: list[np.ndarray] = []
+    for chunk in RrdReader(converted).stream().to_chunks():
+        if not chunk.is_static:
+            rows[chunk.entity_path] += chunk.num_rows
+            columns = chunk.to_record_batch().to_pydict()
+            shown += [cv2.imdecode(np.array(row[0], np.uint8), -1) for row in columns.get("EncodedImage:blob", ())]
+    images = IMAGE + "/compressed"
+    expected = {images if info.name == IMAGE else info.name: info.count for info in mission.streams}
+    assert {topic: rows[topic] for topic in expected} == expected
+    frames = [mission.frame(k) for k in range(8)] if container == "mcap" else []  # of JSON Rerun keeps the text
+    np.testing.assert_array_equal(shown, frames)
+
+
+def rerun(*words: str) -> str:
+    """What Rerun's own command line says."""
+    return subprocess.run([sys.executable, "-m", "rerun", *words], capture_output=True, text=True, check=True).stdout
 
 
 @pytest.mark.parametrize("container", ["ros1", "ros2"])

@@ -20,7 +20,7 @@ from pipelines.simulation.scene import Patch, Scene
 from pipelines.simulation.speeds import speed
 from pipelines.simulation.surfaces import gravel, tiles
 from pipelines.simulation.timing import Timing, schedule
-from readers.streams import CameraInfo, ImageSample, StreamError
+from readers.streams import CameraInfo, ImageError, ImageSample, StreamError
 
 RATE_HZ = 20.0
 GROUND = gravel(128, np.random.default_rng(0))
@@ -153,6 +153,14 @@ def test_wrong_calibration_is_sent_and_changes_no_picture() -> None:
     np.testing.assert_allclose(infos, [60.0] * 10 + [66.0] * 10 + [60.0] * 20)
     from_start = mission(flaws.WrongCalibration(focal_factor=1.1, start_s=0, stop_s=1))
     assert from_start.cameras[IMAGE].matrix[0, 0] == pytest.approx(66.0)
+
+
+def test_a_picture_that_cannot_be_rendered_is_an_error_of_that_image() -> None:
+    below = dataclasses.replace(mission().on_board[0], mount=Mount(np.array([0, 0, -0.3])))
+    image = below.channel().sample(5, 0, 0)
+    assert isinstance(image, ImageSample)
+    with pytest.raises(ImageError, match=r"simulated /camera/image_raw frame 5: camera height -0\.0998 m"):
+        _ = image.data
 
 
 def test_faults_of_other_things_are_refused() -> None:

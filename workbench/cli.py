@@ -365,6 +365,7 @@ def _print_summary(outcome: Outcome) -> None:
         "workbench simulate fault-motion-blur --set faults.0.exposure=0.5 --replay",
         "workbench simulate paper-a --set camera.noise_grey=5 --seed 3 -o mission.bag",
         "workbench simulate paper-a --as paper-a -o folder/",
+        "workbench simulate sensors --stream /camera/image_raw --stream /reference/pose --as paper-a -o folder/",
         "workbench simulate line --picture floor.png --replay --preset paper-a",
         "workbench simulate sensors --show > mine.toml",
         "workbench simulate mine.toml -o mine.mcap",
@@ -391,6 +392,9 @@ def simulate(
     images: Annotated[
         str | None, typer.Option(metavar="FORM", help="Images as jpeg, png or stored [jpeg; png in folders].")
     ] = None,
+    streams: Annotated[
+        list[str] | None, typer.Option("--stream", metavar="TOPIC", help="Write this stream; repeatable [all].")
+    ] = None,
     listed: Annotated[bool, typer.Option("--list", help="List the scenarios.")] = False,
     show: Annotated[bool, typer.Option("--show", help="Print it with all keys, a TOML file to start from.")] = False,
     replayed: Annotated[bool, typer.Option("--replay", help="Replay it without a file in between.")] = False,
@@ -415,8 +419,8 @@ def simulate(
         raise SettingsError("name a scenario, or a TOML file; workbench simulate --list names all")
     if not (show or replayed or out):
         raise SettingsError("say where to: -o FILE writes it, --replay replays it, --show prints it")
-    if replayed and (container or images):
-        raise SettingsError("--replay writes no recording; leave --as and --images out")
+    if replayed and (container or images or streams):
+        raise SettingsError("--replay writes no recording; leave --as, --images and --stream out")
     loaded = scenarios.load(scenario, overrides=overrides or (), seed=seed, picture=picture)
     if show:
         print(scenarios.to_text(loaded.scenario), end="")
@@ -425,7 +429,7 @@ def simulate(
     if replayed:
         _replay_mission(mission, estimator, preset, out, as_json)
     elif out is not None:
-        _write_mission(mission, out, container, images, as_json)
+        _write_mission(mission, out, container, images, streams, as_json)
 
 
 def _replay_mission(
@@ -439,7 +443,12 @@ def _replay_mission(
 
 
 def _write_mission(
-    mission: SimulatedMission, out: Path, container: str | None, images: str | None, as_json: bool
+    mission: SimulatedMission,
+    out: Path,
+    container: str | None,
+    images: str | None,
+    streams: Sequence[str] | None,
+    as_json: bool,
 ) -> None:
     from workbench.session import Progress
     from workbench.writers import write
@@ -451,6 +460,7 @@ def _write_mission(
                 mission,
                 out,
                 container=container,
+                streams=streams,
                 image_format=form,
                 on_progress=lambda done, total: bar(Progress(done, total, 0)),
             )

@@ -162,13 +162,15 @@ def to_text(scenario: Scenario) -> str:
 
 def _table(kind: type, section: Any, path: str) -> Iterator[str]:
     """The lines of one section: its values, then the sections within it."""
-    from pipelines.simulation.sections import is_section, meanings
+    from pipelines.simulation.sections import entry_values, is_section, meanings
 
     inner: list[tuple[str, Any]] = []
     for key, meaning in meanings(kind).items():
         value = getattr(section, key)
-        if is_section(value) or isinstance(value, Mapping) or (key == "faults" and value):
+        if is_section(value) or isinstance(value, Mapping):
             inner.append((key, value))
+        elif entries := entry_values(value):
+            inner.append((key, entries))
         elif value is None:
             yield f"# {key}: {meaning}; not set"
         else:
@@ -176,24 +178,22 @@ def _table(kind: type, section: Any, path: str) -> Iterator[str]:
             yield to_toml({key: _plain(value)}).strip()
     for key, value in inner:
         below = f"{path}.{key}" if path else key
-        if key == "faults":
-            yield from _faults(value)
-            continue
-        yield ""
-        yield f"[{below}]"
-        if isinstance(value, Mapping):
-            yield to_toml(_plain(value)).strip()
+        if isinstance(value, list):
+            for entry in value:
+                yield from ("", f"[[{below}]]", *_values(entry, below))
         else:
-            yield from _table(type(value), value, below)
+            yield from ("", f"[{below}]")
+            yield from _values(value, below) if isinstance(value, Mapping) else _table(type(value), value, below)
 
 
-def _faults(faults: Sequence[Any]) -> Iterator[str]:
-    from pipelines.simulation.sections import fault_values
-
-    for fault in faults:
-        yield ""
-        yield "[[faults]]"
-        yield to_toml(_plain(fault_values(fault))).strip()
+def _values(values: Mapping[str, Any], path: str) -> Iterator[str]:
+    """The lines of a table without descriptions, the tables within it last."""
+    if plain := {key: _plain(value) for key, value in values.items() if not isinstance(value, Mapping)}:
+        yield to_toml(plain).strip()
+    for key, value in values.items():
+        if isinstance(value, Mapping):
+            yield f"[{path}.{key}]"
+            yield from _values(value, f"{path}.{key}")
 
 
 def _plain(value: Any) -> Any:

@@ -12,6 +12,9 @@ _RULES: Mapping[str, Callable[[float], bool]] = {
     "0 or more": lambda value: value >= 0,
     "a share within 0 and 1": lambda value: 0 <= value <= 1,
     "a share within 0 and 0.5": lambda value: 0 <= value <= 0.5,
+    "within ±1e9": lambda value: abs(value) <= 1e9,
+    "a whole number above 0": lambda value: value > 0 and value == round(value),
+    "an even number above 0": lambda value: value > 0 and value % 2 == 0,
 }
 
 

@@ -11,17 +11,31 @@ import json
 import re
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any, Literal, TypeVar
+from typing import Any, ClassVar, Literal, TypeVar
+
+from pipelines.simulation.checks import check
 
 FAULTS_STREAM = "/truth/faults"
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class Fault:
-    """Something that is wrong from `start_s` to before `stop_s`."""
+    """Something that is wrong from `start_s` to before `stop_s`.
+
+    Raises:
+        ValueError: a number is not finite, or breaks its rule (see `checks`).
+    """
+
+    rules: ClassVar[Mapping[str, str]] = {}
 
     start_s: float
     stop_s: float
+
+    def __post_init__(self) -> None:
+        numbers = [f.name for f in dataclasses.fields(self) if isinstance(getattr(self, f.name), float | int | tuple)]
+        check(self, "a finite number", *(name for name in numbers if name != "in_view_s"))
+        for name, rule in self.rules.items():
+            check(self, rule, name)
 
     @property
     def name(self) -> str:
@@ -45,6 +59,8 @@ class RepetitiveTexture(Fault):
     the intervals in which any of it is in view.
     """
 
+    rules: ClassVar = {"period_px": "an even number above 0", "margin_m": "0 or more"}
+
     pattern: Literal["tiles", "stripes"] = "tiles"
     period_px: int = 8
     margin_m: float = 0.3
@@ -58,6 +74,8 @@ class LowTexture(Fault):
 
     Place and times are those of `RepetitiveTexture`.
     """
+
+    rules: ClassVar = {"gradient_rms": "0 or more", "margin_m": "0 or more"}
 
     gradient_rms: float = 0.4
     margin_m: float = 0.3
@@ -100,6 +118,8 @@ class HeightChange(Fault):
 class MotionBlur(Fault):
     """The shutter stays open for `exposure` of the frame interval, about the frame's time."""
 
+    rules: ClassVar = {"exposure": "a share within 0 and 1", "samples": "a whole number above 0"}
+
     exposure: float
     samples: int = 15
 
@@ -107,6 +127,8 @@ class MotionBlur(Fault):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ExposureJump(Fault):
     """The images are `gain` times as bright, plus `offset_grey`."""
+
+    rules: ClassVar = {"gain": "0 or more"}
 
     gain: float
     offset_grey: float = 0.0
@@ -116,12 +138,16 @@ class ExposureJump(Fault):
 class ImageNoise(Fault):
     """The standard deviation of the image noise is `noise_grey`."""
 
+    rules: ClassVar = {"noise_grey": "0 or more"}
+
     noise_grey: float = 10.0
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LensDirt(Fault):
     """A fixed pattern lies over the images with the weight `share`, 0…1."""
+
+    rules: ClassVar = {"share": "a share within 0 and 1"}
 
     share: float = 0.35
 
@@ -139,6 +165,8 @@ class DuplicateFrames(Fault):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class LateImages(Fault):
     """The images are stamped `latency_s` after they were taken."""
+
+    rules: ClassVar = {"latency_s": "0 or more"}
 
     latency_s: float
 
@@ -163,6 +191,8 @@ class TrackSlip(Fault):
 class TrackOutliers(Fault):
     """A `share` of the tracked points is off by up to `size_px` in u and v."""
 
+    rules: ClassVar = {"share": "a share within 0 and 1", "size_px": "0 or more"}
+
     share: float = 0.05
     size_px: float = 50.0
 
@@ -173,6 +203,8 @@ class TrackOutliers(Fault):
 @dataclass(frozen=True, slots=True, kw_only=True)
 class WrongCalibration(Fault):
     """The calibration that is sent differs from the camera: focal length times `focal_factor`, centre moved."""
+
+    rules: ClassVar = {"focal_factor": "above 0"}
 
     focal_factor: float = 1.0
     centre_px: tuple[float, float] = (0.0, 0.0)

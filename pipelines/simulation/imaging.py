@@ -31,7 +31,7 @@ from pipelines.simulation.motion import Motion, Mount
 from pipelines.simulation.render import behind_dirt, expose, noise_key_of, view
 from pipelines.simulation.scene import Scene
 from pipelines.simulation.timing import Schedule
-from readers.streams import Camera, ImageSample, StreamError, StreamKind
+from readers.streams import Camera, ImageError, ImageSample, StreamKind
 
 Floats = NDArray[np.float64]
 
@@ -166,16 +166,14 @@ class CameraOnBoard:
             width_px=self.camera.width_px,
             height_px=self.camera.height_px,
             step_bytes=self.camera.width_px,
-            source=f"{self.name} {self.stream} frame {number}",
+            source=self._source(number),
         )
 
     def _bytes(self, number: int) -> memoryview:
-        """Grey levels of a picture.
-
-        Raises:
-            StreamError: this camera cannot see this scene.
-        """
         try:
             return self.picture(number).data.cast("B")
         except ValueError as error:
-            raise StreamError(f"{self.name}: {self.stream}, frame {number}: {error}") from error
+            raise ImageError(f"{self._source(number)}: {error}") from error
+
+    def _source(self, number: int) -> str:
+        return f"{self.name} {self.stream} frame {number}"

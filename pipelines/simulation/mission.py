@@ -6,13 +6,14 @@ when their bytes are. The truth and the list of faults are attributes, and strea
 
 from __future__ import annotations
 
-import dataclasses
 import hashlib
 import heapq
 import json
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from dataclasses import asdict, replace
 from operator import itemgetter
 from pathlib import Path
+from types import MappingProxyType
 from typing import Any
 
 import numpy as np
@@ -37,12 +38,12 @@ from pipelines.simulation.sensors import (
 from pipelines.simulation.sensors import HEIGHT as RANGE
 from pipelines.simulation.surfaces import Surface
 from pipelines.simulation.timing import Timing, schedule
-from readers.streams import Camera, CameraInfo, Recording, Sample, StreamError, StreamInfo
+from readers.streams import Camera, CameraInfo, Landmark, Recording, Sample, StreamError, StreamInfo
 
 Floats = NDArray[np.float64]
 
 IMAGE, INFO, POSE, HEIGHT = "/camera/image_raw", CALIBRATION, REFERENCE, RANGE
-CAMERA_FRAME = "camera_ground"
+LEVEL_FRAME = "camera_ground"  # at the camera, with the axes of the body
 START_NS = 1_700_000_000_000_000_000
 PAPER_HEIGHT_M, PAPER_FOCAL_PX, PAPER_SIDE_PX = 0.2002, 256.0, 512
 
@@ -57,6 +58,7 @@ class SimulatedMission(Recording):
         motion: how the vehicle moves.
         cameras: the cameras on board; frames and poses of the truth are those of the first one.
         faults: what goes wrong, as it really happens.
+        landmarks: the points that are tracked, by the numbers of their tracks.
         description: what the mission is made of, in values that JSON has; equal missions have equal ones.
 
     Attributes:
@@ -79,10 +81,12 @@ class SimulatedMission(Recording):
         motion: Motion,
         cameras: Sequence[CameraOnBoard] = (),
         faults: Sequence[Fault] = (),
+        landmarks: Mapping[int, Landmark] = MappingProxyType({}),
         description: Mapping[str, Any],
     ) -> None:
         self.path, self.start_ns, self.motion = Path(name), start_ns, motion
         self.on_board, self.faults, self.description = tuple(cameras), tuple(faults), dict(description)
+        self._landmarks = dict(landmarks)
         self._channels = {channel.stream: channel for channel in channels}
         if len(self._channels) != len(channels):
             raise ValueError(f"{name}: two channels have the same name: {[channel.stream for channel in channels]}")
@@ -133,6 +137,11 @@ class SimulatedMission(Recording):
                 first = info.sample(int(info.number[0]), int(info.stamp_ns[0]), int(info.received_ns[0]))
                 sent[camera.stream] = first.camera if isinstance(first, CameraInfo) else camera.camera
         return sent
+
+    @property
+    def landmarks(self) -> dict[int, Landmark]:
+        """The true places of the points that are tracked."""
+        return dict(self._landmarks)
 
     def read(
         self,
@@ -245,7 +254,7 @@ def nadir_mission(
     Args:
         surface: the ground.
         poses: x (m), y (m), heading (rad) of the camera [n, 3], z up, counter-clockwise.
-        camera: intrinsics, without distortion; paper A's by default.
+        camera: intrinsics; paper A's by default.
         height_m: height above the ground, one number or [n].
         roll_rad: roll of the camera, one number or [n] (see `motion`).
         pitch_rad: pitch of the camera, one number or [n].
@@ -261,7 +270,8 @@ def nadir_mission(
         ValueError: an array has another length than the poses, or a fault is of another kind.
     """
     motion = Waypoints(np.arange(len(poses)) / rate_hz, poses, height_m, roll_rad, pitch_rad)
-    mount, camera, timing = Mount(), camera or nadir_camera(), Timing(rate_hz=rate_hz)
+    mount, timing = Mount(), Timing(rate_hz=rate_hz)
+    camera = replace(camera or nadir_camera(), body_t_camera=mount.body_t_camera)
     unfit = [fault.name for fault in faults if not isinstance(fault, OF_IMAGES + OF_GROUND)]
     if unfit:
         raise ValueError(f"{name}: {unfit[0]} is no fault of the images or the ground; make a scenario for it")
@@ -284,7 +294,7 @@ def nadir_mission(
     )
     channels = [
         camera_info_channel(camera, timing, duration_s=motion.duration_s, faults=met, **start),
-        reference_channel(motion, Reference(timing=timing, child_frame=CAMERA_FRAME), **start),
+        reference_channel(motion, Reference(timing=timing, child_frame=LEVEL_FRAME), **start),
         height_channel(motion, Height(timing=timing), mount, **start),
         on_board.channel(),
     ]
@@ -301,8 +311,9 @@ def nadir_mission(
             + repr((surface.texels_per_px, surface.metres_per_px, surface.scatter)),
             "motion": digest(motion.t_s, poses, motion.height_m, motion.roll_rad, motion.pitch_rad),
             "camera": [camera.width_px, camera.height_px, camera.matrix.tolist()],
+            "lens": [camera.distortion_model, camera.distortion.tolist()],
             "images": [start_ns, noise_grey, vignetting, seed],
-            "faults": [[fault.name, dataclasses.asdict(fault)] for fault in met],
+            "faults": [[fault.name, asdict(fault)] for fault in met],
         },
     )
 

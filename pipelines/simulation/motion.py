@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.simulation.signals import smooth_step as smooth_step
+from readers.streams import unknown_transform
 
 Floats = NDArray[np.float64]
 
@@ -105,6 +106,15 @@ class Mount:
     position_m: Floats = field(default_factory=lambda: np.zeros(3))
     body_r_camera: Floats = field(default_factory=lambda: NADIR)
     hold: Hold = Hold.RIGID
+
+    @property
+    def body_t_camera(self) -> Floats:
+        """The transform [4, 4] from camera to body; NaN where a gimbal moves it."""
+        transform = unknown_transform()
+        if self.hold is Hold.RIGID:
+            transform[:3] = np.column_stack([self.body_r_camera, self.position_m])
+            transform[3] = [0, 0, 0, 1]
+        return transform
 
     def world_t_camera(self, motion: Kinematics) -> tuple[Floats, Floats]:
         """Rotations `world_r_camera` [n, 3, 3] and positions in the world [n, 3] of the camera."""

@@ -52,9 +52,13 @@ def centres(camera: Camera, mount: Mount, motion: Motion, t_s: Floats) -> Floats
 
 def corners(camera: Camera, mount: Mount, motion: Motion, t_s: Floats) -> Floats:
     """Ground points of the image's four corners, in order around it [n, 4, 2]."""
+    return ground_points(camera, mount, motion, t_s, outline(camera))
+
+
+def outline(camera: Camera) -> Floats:
+    """The corners of the image, in order around it [4, 2]."""
     u, v = camera.width_px - 0.5, camera.height_px - 0.5
-    around = np.array([[-0.5, -0.5], [u, -0.5], [u, v], [-0.5, v]])
-    return ground_points(camera, mount, motion, t_s, around)
+    return np.array([[-0.5, -0.5], [u, -0.5], [u, v], [-0.5, v]])
 
 
 def faults_met(faults: Sequence[Fault], camera: Camera, mount: Mount, motion: Motion, t_s: Floats) -> tuple[Fault, ...]:

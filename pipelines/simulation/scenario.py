@@ -13,24 +13,24 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import PurePath
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy.ndimage
 from numpy.typing import ArrayLike, NDArray
 from pydantic import Field, model_validator
 
-from pipelines.lens import pinhole
+from pipelines.lens import pinhole, rays
 from pipelines.simulation import faults as flaws
 from pipelines.simulation.channels import Channel, rng_of
 from pipelines.simulation.curves import curve
-from pipelines.simulation.driving import Disturbed, Drive
+from pipelines.simulation.driving import Chain, Disturbed, Drive, Swaying, Turn, stop
 from pipelines.simulation.families import ground as ground_of_family
 from pipelines.simulation.faults import Fault
 from pipelines.simulation.imaging import OF_IMAGES, CameraOnBoard
-from pipelines.simulation.mission import IMAGE, INFO, START_NS, SimulatedMission, digest
+from pipelines.simulation.mission import IMAGE, INFO, LEVEL_FRAME, START_NS, SimulatedMission, digest
 from pipelines.simulation.motion import FORWARD, NADIR, Kinematics, Motion, Mount, looking
-from pipelines.simulation.patches import OF_GROUND, faults_met, patches_of
+from pipelines.simulation.patches import OF_GROUND, faults_met, outline, patches_of
 from pipelines.simulation.scene import Plane, Relief, Scene, chessboard, chessboard_corners, poster, upright
 from pipelines.simulation.sections import (
     AnyFault,
@@ -48,12 +48,14 @@ from pipelines.simulation.sections import (
     Fluctuation,
     FrontCamera,
     Ground,
+    Leg,
     Positive,
     Section,
     Surroundings,
     Trajectory,
 )
 from pipelines.simulation.sensors import (
+    BODY_FRAME,
     Reference,
     camera_info_channel,
     faults_channel,
@@ -67,10 +69,10 @@ from pipelines.simulation.sensors import (
     truth_channel,
 )
 from pipelines.simulation.signals import fluctuation
-from pipelines.simulation.speeds import SPEEDS, Speed, speed
+from pipelines.simulation.speeds import SPEEDS, Speed, speed, trapezoid
 from pipelines.simulation.surfaces import WRAP, Surface, surface_from_image
 from pipelines.simulation.timing import schedule
-from readers.streams import Camera, RangeSample, Sample, TrackSample
+from readers.streams import Camera, Landmark, RangeSample, Sample, TrackSample
 
 Floats = NDArray[np.float64]
 
@@ -86,7 +88,7 @@ class Scenario(Section):
     seed: int = Field(0, ge=0, description="seed of everything random")
     duration_s: Positive | None = Field(None, description="length; otherwise that of the speed profile, or 8 s")
     frames: Count | None = Field(None, description="length in frames of the first camera; overrides duration_s")
-    start_ns: int = Field(START_NS, ge=0, description="time of the start, ns since 1970")
+    start_ns: int = Field(START_NS, ge=0, le=1 << 62, description="time of the start, ns since 1970")
     ground: Ground = Field(Ground(), description="the ground")
     trajectory: Trajectory = Field(Trajectory(), description="the way and the speed")
     body: Fluctuation = Field(Fluctuation(), description="how the body sways")
@@ -152,6 +154,7 @@ def build(scenario: Scenario, *, picture: ArrayLike | None = None) -> SimulatedM
     cameras = _cameras(scenario, motion, faults, picture)
     values = described(scenario, picture)
     truth = faults_channel(faults, start_ns=scenario.start_ns, scenario=values)
+    tracked = landmarks_of(scenario.surroundings)
     return SimulatedMission(
         [truth, *_channels(scenario, motion, faults), *(camera.channel() for camera in cameras)],
         name=scenario.name,
@@ -159,6 +162,7 @@ def build(scenario: Scenario, *, picture: ArrayLike | None = None) -> SimulatedM
         motion=motion,
         cameras=cameras,
         faults=faults,
+        landmarks={number: Landmark(position_m=place, sigma_m=np.zeros(3)) for number, place in enumerate(tracked)},
         description=values,
     )
 
@@ -207,17 +211,32 @@ class Lasting:
 def _motion(scenario: Scenario) -> Motion:
     way, body, seed = scenario.trajectory, scenario.body, scenario.seed
     with _named("trajectory"):
-        pace = _speed(scenario)
-        drive = Drive(
-            curve(way.curve, **way.parameters),
-            pace.with_stops(way.stops, ramp_s=way.stop_ramp_s),
-            sideslip_rad=way.sideslip_rad,
-            height_m=fluctuation(body.height_rms_m, body.height_tau_s, seed=seed, name="height"),
-            roll_rad=fluctuation(body.roll_rms_rad, body.roll_tau_s, seed=seed, name="roll", mean=body.roll_rad),
-            pitch_rad=fluctuation(body.pitch_rms_rad, body.pitch_tau_s, seed=seed, name="pitch", mean=body.pitch_rad),
-        )
+        driven = Chain([_leg(leg, way) for leg in way.legs] * way.rounds) if way.legs else _drive(scenario)
+    swaying = Swaying(
+        driven,
+        height_m=fluctuation(body.height_rms_m, body.height_tau_s, seed=seed, name="height"),
+        roll_rad=fluctuation(body.roll_rms_rad, body.roll_tau_s, seed=seed, name="roll", mean=body.roll_rad),
+        pitch_rad=fluctuation(body.pitch_rms_rad, body.pitch_tau_s, seed=seed, name="pitch", mean=body.pitch_rad),
+    )
     with _named("faults"):
-        return Lasting(Disturbed(drive, scenario.faults), _duration_s(scenario) or pace.duration_s)
+        return Lasting(Disturbed(swaying, scenario.faults), _duration_s(scenario) or driven.duration_s)
+
+
+def _drive(scenario: Scenario) -> Motion:
+    """One curve, driven with the speed profile."""
+    way = scenario.trajectory
+    slip = fluctuation(
+        way.sideslip_rms_rad, way.sideslip_tau_s, seed=scenario.seed, name="sideslip", mean=way.sideslip_rad
+    )
+    pace = _speed(scenario).with_stops(way.stops, ramp_s=way.stop_ramp_s)
+    return Drive(curve(way.curve, **way.parameters), pace, sideslip_rad=slip)
+
+
+def _leg(leg: Leg, way: Trajectory) -> Motion:
+    if leg.drive_m is not None:
+        pace = trapezoid(leg.drive_m, way.speed_kmh / 3.6, leg.acceleration_mps2)
+        return Drive(curve(leg.curve, **leg.parameters), pace, sideslip_rad=way.sideslip_rad)
+    return stop(leg.stop_s) if leg.stop_s is not None else Turn(leg.turn_rad or 0.0, leg.turn_s)
 
 
 def _speed(scenario: Scenario) -> Speed:
@@ -243,12 +262,34 @@ def _duration_s(scenario: Scenario) -> float | None:
 # ---- cameras and what they see
 
 
-def _mount(section: CameraSection, base: Floats) -> Mount:
-    turned = looking(base, yaw_rad=section.yaw_rad, pitch_rad=section.pitch_rad, roll_rad=section.roll_rad)
-    return Mount(np.array([section.ahead_m, section.left_m, section.height_m]), turned, section.hold)
+class Post(NamedTuple):
+    """A place for a camera: its section, its streams and frame, and where it looks if it is not turned."""
+
+    section: str
+    images: str
+    info: str
+    frame: str
+    body_r_camera: Floats
 
 
-def _intrinsics(section: CameraSection, frame: str) -> Camera:
+DOWN = Post("camera", IMAGE, INFO, "camera", NADIR)
+FRONT = Post("front", FRONT_IMAGE, FRONT_INFO, "front", FORWARD)
+
+
+def _posts(scenario: Scenario) -> Iterator[tuple[Post, CameraSection]]:
+    """The cameras on board, the first one first."""
+    if scenario.camera is not None:
+        yield DOWN, scenario.camera
+    if scenario.front is not None:
+        yield FRONT, scenario.front
+
+
+def _truly(section: CameraSection, post: Post) -> tuple[Camera, Mount]:
+    """What a camera truly is, and how it is mounted."""
+    turned = looking(
+        post.body_r_camera, yaw_rad=section.yaw_rad, pitch_rad=section.pitch_rad, roll_rad=section.roll_rad
+    )
+    mount = Mount(np.array([section.ahead_m, section.left_m, section.height_m]), turned, section.hold)
     camera = pinhole(
         section.width_px,
         section.height_px,
@@ -256,7 +297,7 @@ def _intrinsics(section: CameraSection, frame: str) -> Camera:
         model=section.distortion_model,
         distortion=section.distortion,
     )
-    return replace(camera, frame=frame)
+    return replace(camera, frame=post.frame, body_t_camera=mount.body_t_camera), mount
 
 
 def _met(scenario: Scenario, motion: Motion) -> tuple[Fault, ...]:
@@ -271,11 +312,8 @@ def _met(scenario: Scenario, motion: Motion) -> tuple[Fault, ...]:
         return scenario.faults
     section = scenario.camera
     with _named("camera"):
-        camera, mount, t_s = (
-            _intrinsics(section, "camera"),
-            _mount(section, NADIR),
-            section.timing.times_s(motion.duration_s),
-        )
+        camera, mount = _truly(section, DOWN)
+        t_s = section.timing.times_s(motion.duration_s)
     with _named("faults"):
         return faults_met(scenario.faults, camera, mount, motion, t_s)
 
@@ -322,10 +360,12 @@ def height_of(relief: Relief, x_m: Floats, y_m: Floats) -> Floats:
 
 def _scene(scenario: Scenario, faults: Sequence[Fault], picture: ArrayLike | None) -> Scene:
     surface, around = _surface(scenario, picture), scenario.surroundings
+    with _named("faults"):
+        patches = patches_of(faults, surface, scenario.seed)
     with _named("surroundings"):
         return Scene(
             surface,
-            patches=patches_of(faults, surface, scenario.seed),
+            patches=patches,
             relief=_relief(scenario),
             planes=tuple(_planes(around, scenario.seed)),
             background_grey=around.background_grey,
@@ -360,30 +400,21 @@ def _cameras(
     if scenario.first_camera is None:
         return []
     scene = _scene(scenario, faults, picture)
-    cameras = []
-    if scenario.camera is not None:
-        cameras.append(_camera(scenario, scenario.camera, IMAGE, "camera", NADIR, motion, scene, faults))
-    if scenario.front is not None:
-        cameras.append(_camera(scenario, scenario.front, FRONT_IMAGE, "front", FORWARD, motion, scene, faults))
-    return cameras
+    return [_camera(scenario, section, post, motion, scene, faults) for post, section in _posts(scenario)]
 
 
 def _camera(
-    scenario: Scenario,
-    section: CameraSection,
-    stream: str,
-    frame: str,
-    base: Floats,
-    motion: Motion,
-    scene: Scene,
-    faults: tuple[Fault, ...],
+    scenario: Scenario, section: CameraSection, post: Post, motion: Motion, scene: Scene, faults: tuple[Fault, ...]
 ) -> CameraOnBoard:
-    with _named("front" if base is FORWARD else "camera"):
-        return CameraOnBoard(
-            stream=stream,
+    own_seed = int(rng_of(scenario.seed, post.images).integers(1 << 62))
+    with _named(post.section):
+        camera, mount = _truly(section, post)
+        rays(camera, outline(camera))
+        on_board = CameraOnBoard(
+            stream=post.images,
             start_ns=scenario.start_ns,
-            camera=_intrinsics(section, frame),
-            mount=_mount(section, base),
+            camera=camera,
+            mount=mount,
             motion=motion,
             scene=scene,
             plan=schedule(
@@ -391,7 +422,7 @@ def _camera(
                 duration_s=motion.duration_s,
                 start_ns=scenario.start_ns,
                 seed=scenario.seed,
-                stream=stream,
+                stream=post.images,
                 faults=faults,
             ),
             rate_hz=section.timing.rate_hz,
@@ -399,10 +430,14 @@ def _camera(
             readout_s=section.readout_s,
             noise_grey=section.noise_grey,
             vignetting=section.vignetting,
-            seed=scenario.seed if base is NADIR else int(rng_of(scenario.seed, stream).integers(1 << 62)),
+            seed=scenario.seed if post is DOWN else own_seed,
             faults=faults,
             name=scenario.name,
         )
+        lowest = float(on_board.heights_m.min())
+        if lowest <= 0:
+            raise ValueError(f"it is at a height of {lowest:g} m at times: mount it higher, or let the body sway less")
+        return on_board
 
 
 # ---- everything else on board
@@ -411,16 +446,21 @@ def _camera(
 def _channels(scenario: Scenario, motion: Motion, faults: tuple[Fault, ...]) -> Iterator[Channel]:
     """The channels of all that is on board, but for images and faults."""
     start: dict[str, Any] = {"start_ns": scenario.start_ns, "seed": scenario.seed}
-    if scenario.camera is not None:
-        yield _info(scenario, scenario.camera, INFO, "camera", motion, faults)
-    if scenario.front is not None:
-        yield _info(scenario, scenario.front, FRONT_INFO, "front", motion, faults)
+    for post, section in _posts(scenario):
+        yield camera_info_channel(
+            _truly(section, post)[0],
+            section.timing,
+            duration_s=motion.duration_s,
+            faults=faults,
+            stream=post.info,
+            **start,
+        )
     if scenario.truth is not None:
         yield truth_channel(motion, scenario.truth, **start)
     if scenario.reference is not None:
         yield reference_channel(motion, _at_camera(scenario.reference, scenario), **start)
     if scenario.height is not None and scenario.camera is not None:
-        mount, relief = _mount(scenario.camera, NADIR), _relief(scenario)
+        (_, mount), relief = _truly(scenario.camera, DOWN), _relief(scenario)
         ground = level_ground if relief is None else partial(height_of, relief)
         with _named("height"):
             yield _single_precision(height_channel(motion, scenario.height, mount, ground=ground, **start))
@@ -431,7 +471,7 @@ def _channels(scenario: Scenario, motion: Motion, faults: tuple[Fault, ...]) -> 
     if scenario.gnss is not None:
         yield gnss_channel(motion, scenario.gnss, **start)
     if scenario.tracks is not None and scenario.front is not None:
-        camera, mount = _intrinsics(scenario.front, "front"), _mount(scenario.front, FORWARD)
+        camera, mount = _truly(scenario.front, FRONT)
         points = landmarks_of(scenario.surroundings)
         with _named("tracks"):
             tracked = tracks_channel(
@@ -454,24 +494,12 @@ def _single_precision(channel: Channel) -> Channel:
     return replace(channel, sample=sample)
 
 
-def _info(
-    scenario: Scenario, section: CameraSection, stream: str, frame: str, motion: Motion, faults: tuple[Fault, ...]
-) -> Channel:
-    return camera_info_channel(
-        _intrinsics(section, frame),
-        section.timing,
-        duration_s=motion.duration_s,
-        start_ns=scenario.start_ns,
-        seed=scenario.seed,
-        faults=faults,
-        stream=stream,
-    )
-
-
 def _at_camera(reference: Reference, scenario: Scenario) -> Reference:
-    """The reference, its point counted from the first camera where there is one."""
+    """The reference, its point counted from the first camera where there is one, whose frame is not the body's."""
     section = scenario.first_camera
     if section is None:
         return reference
     x, y, z = reference.point_m
-    return replace(reference, point_m=(x + section.ahead_m, y + section.left_m, z + section.height_m))
+    frame = LEVEL_FRAME if reference.child_frame == BODY_FRAME else reference.child_frame
+    place = (x + section.ahead_m, y + section.left_m, z + section.height_m)
+    return replace(reference, point_m=place, child_frame=frame)

@@ -21,6 +21,8 @@ from pydantic import (
     PlainValidator,
     TypeAdapter,
     ValidationError,
+    field_validator,
+    model_validator,
 )
 
 from pipelines.simulation.faults import FAULTS, Fault
@@ -102,6 +104,8 @@ def fault_of(values: Any) -> Fault:
         fault = TypeAdapter(kind).validate_python(_completed(kind, parameters, {}))
     except ValidationError as error:
         first = error.errors()[0]
+        if first["type"] == "value_error":
+            raise ValueError(f"{name}: {str(first['ctx']['error']).partition(': ')[2]}") from None
         raise ValueError(f"{name}: {'.'.join(map(str, first['loc']))}: {first['msg']}") from None
     except ValueError as error:
         raise ValueError(f"{name}: {error}") from None
@@ -138,6 +142,25 @@ class Ground(Section):
     relief_correlation_m: Positive = Field(0.05, description="their correlation length")
 
 
+class Leg(Section):
+    """A piece of a way from standstill to standstill: a drive, a turn on the spot, or a stop."""
+
+    drive_m: Finite | None = Field(None, description="a drive of that length; negative goes back in reverse")
+    turn_rad: Finite | None = Field(None, description="a turn on the spot; positive to the left")
+    stop_s: Positive | None = Field(None, description="a stop of that time")
+    curve: str = Field("line", description="what is driven along, see curves.py")
+    parameters: Parameters = Field({}, description="parameters of the curve")
+    acceleration_mps2: Positive = Field(0.5, description="of a drive, up to speed_kmh and down again")
+    turn_s: Positive = Field(2.0, description="time of a turn")
+
+    @model_validator(mode="after")
+    def _one_thing(self) -> Leg:
+        given = [key for key in ("drive_m", "turn_rad", "stop_s") if getattr(self, key) is not None]
+        if len(given) != 1:
+            raise ValueError(f"a leg has one of drive_m, turn_rad and stop_s, here: {', '.join(given) or 'none'}")
+        return self
+
+
 class Trajectory(Section):
     """The way of the vehicle's turning point, and how fast it goes along it."""
 
@@ -149,6 +172,20 @@ class Trajectory(Section):
     stops: tuple[tuple[Finite, Finite], ...] = Field((), description="stops: time at which each begins, and length, s")
     stop_ramp_s: Positive = Field(0.5, description="time of slowing down before and of speeding up after a stop")
     sideslip_rad: Finite = Field(0.0, description="angle from the heading to the direction of travel, to the left")
+    sideslip_rms_rad: NotNegative = Field(0.0, description="standard deviation of the sideslip about that")
+    sideslip_tau_s: Positive = Field(0.5, description="its correlation time")
+    legs: tuple[Leg, ...] = Field(
+        (), description="pieces in place of curve and profile: a drive_m, turn_rad or stop_s each"
+    )
+    rounds: Count = Field(1, description="how often the legs are driven")
+
+    @model_validator(mode="after")
+    def _either_legs_or_a_profile(self) -> Trajectory:
+        if self.legs and (self.stops or self.sideslip_rms_rad):
+            raise ValueError("legs stop by themselves, with a steady sideslip: leave stops and sideslip_rms_rad out")
+        if self.legs and self.speed_kmh <= 0:
+            raise ValueError("legs are driven at a positive speed_kmh; a negative drive_m goes back in reverse")
+        return self
 
 
 class Fluctuation(Section):
@@ -186,6 +223,12 @@ class CameraSection(Section):
     vignetting: Share = Field(0.0, description="fall of brightness in the image corners")
     exposure_s: NotNegative = Field(0.0, description="how long the shutter is open")
     readout_s: NotNegative = Field(0.0, description="rolling shutter: from the first row to the last")
+
+    @field_validator("timing", mode="before")
+    @classmethod
+    def _over_the_usual_timing(cls, values: Any) -> Any:
+        usual = dataclasses.asdict(cls.model_fields["timing"].default)
+        return usual | dict(values) if isinstance(values, Mapping) else values
 
 
 class DownCamera(CameraSection):
@@ -237,6 +280,14 @@ AnyTracks = Annotated[Tracks, _known(Tracks)]
 def is_section(value: Any) -> bool:
     """Whether a value of a scenario has keys of its own with meanings."""
     return isinstance(value, BaseModel) or (dataclasses.is_dataclass(value) and not isinstance(value, Fault | type))
+
+
+def entry_values(value: Any) -> list[dict[str, Any]]:
+    """What is set in each of the faults or legs of a scenario; empty for a value that is no list of them."""
+    if not isinstance(value, tuple):
+        return []
+    faults = [fault_values(entry) for entry in value if isinstance(entry, Fault)]
+    return faults + [entry.model_dump(exclude_defaults=True) for entry in value if isinstance(entry, Section)]
 
 
 def meanings(kind: type) -> dict[str, str]:

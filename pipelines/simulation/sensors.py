@@ -238,33 +238,11 @@ def odometer_channel(
     The pose of ``odometry`` is the dead reckoning of these values from the origin (`dead_reckoning`).
     """
     plan, dice, state = _observed(motion, odometer.timing, start_ns, seed, stream)
-    rate_hz = odometer.timing.rate_hz
-    felt = _felt(odometer.sampling, motion, state, rate_hz)
-    speed = measured(
-        felt.body_velocity_mps[:, 0],
-        partial(dice, "speed"),
-        rate_hz,
-        density=odometer.speed_density,
-        bias=odometer.speed_bias_mps,
-        walk=odometer.speed_walk,
-        scale=odometer.speed_scale,
-    )
-    turn = measured(
-        felt.rate_radps[:, 2],
-        partial(dice, "turn"),
-        rate_hz,
-        density=odometer.turn_density,
-        bias=odometer.turn_bias_radps,
-        walk=odometer.turn_walk,
-        scale=odometer.turn_scale,
-    )
+    felt = _felt(odometer.sampling, motion, state, odometer.timing.rate_hz)
+    factor = np.ones(len(plan.t_s))
     for fault in of_kind(faults, OdometerScale):
-        speed[during([fault], plan.t_s)] *= fault.factor
-    if odometer.tick_m:
-        half = odometer.track_m / 2
-        wheels = np.column_stack([speed - half * turn, speed + half * turn])
-        left, right = in_ticks(dice("ticks"), wheels, odometer.tick_m, rate_hz).T
-        speed, turn = (left + right) / 2, (right - left) / odometer.track_m
+        factor[during([fault], plan.t_s)] *= fault.factor
+    speed, turn = _told_by_wheels(odometer, felt, factor, dice)
     zeros = np.zeros_like(speed)
     velocity, rate = frozen(np.column_stack([speed, zeros, zeros])), frozen(np.column_stack([zeros, zeros, turn]))
     posed = odometer.message == "odometry"
@@ -284,6 +262,35 @@ def odometer_channel(
     message = "nav_msgs/msg/Odometry" if posed else "geometry_msgs/msg/TwistStamped"
     frame = ODOMETRY_FRAME if posed else BODY_FRAME
     return _channel(stream, StreamKind.ODOMETRY, message, frame, plan, sample)
+
+
+def _told_by_wheels(odometer: Odometer, felt: _Felt, factor: Floats, dice: Dice) -> tuple[Floats, Floats]:
+    """Speed in m/s and yaw rate in rad/s [n] with all errors; the speed is off by a `factor` [n] besides."""
+    rate_hz = odometer.timing.rate_hz
+    speed = factor * measured(
+        felt.body_velocity_mps[:, 0],
+        partial(dice, "speed"),
+        rate_hz,
+        density=odometer.speed_density,
+        bias=odometer.speed_bias_mps,
+        walk=odometer.speed_walk,
+        scale=odometer.speed_scale,
+    )
+    turn = measured(
+        felt.rate_radps[:, 2],
+        partial(dice, "turn"),
+        rate_hz,
+        density=odometer.turn_density,
+        bias=odometer.turn_bias_radps,
+        walk=odometer.turn_walk,
+        scale=odometer.turn_scale,
+    )
+    if odometer.tick_m:
+        half = odometer.track_m / 2
+        wheels = np.column_stack([speed - half * turn, speed + half * turn])
+        left, right = in_ticks(dice("ticks"), wheels, odometer.tick_m, rate_hz).T
+        speed, turn = (left + right) / 2, (right - left) / odometer.track_m
+    return speed, turn
 
 
 def dead_reckoning(t_s: Floats, speed_mps: Floats, turn_radps: Floats) -> tuple[Floats, Floats]:

@@ -61,7 +61,8 @@ class Timing:
         check(self, "0 or more", "start_s", "latency_s", "latency_jitter_s", "stamp_jitter_s")
         check(self, "a share within 0 and 1", "drop_share", "duplicate_share")
         check(self, "a share within 0 and 0.5", "disorder_share")
-        check(self, "a finite number", "clock_offset_s", "clock_drift_ppm")
+        check(self, "a finite number", "clock_drift_ppm")
+        check(self, "within ±1e9", "clock_offset_s")  # so that stamps stay whole nanoseconds of 64 bits
 
     def times_s(self, duration_s: float) -> Floats:
         """True times ``start_s + k / rate_hz`` [n] of all measurements of a mission, its end included.

@@ -1,4 +1,4 @@
-"""Results in a CSV file that grows row by row, so that an interrupted computation goes on where it stopped."""
+"""Results in a CSV file that grows part by part, so that an interrupted computation goes on where it stopped."""
 
 from __future__ import annotations
 
@@ -6,10 +6,33 @@ import csv
 import io
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
+from typing import Protocol, TypeVar
 
 from readers.streams import RecordingError
+from workbench.reproduce.tasks import OnTick, Tick, carried_out
 
 Value = str | int | float
+
+
+class Part(Protocol):
+    """A part of the work, which gives some rows."""
+
+    @property
+    def keys(self) -> Sequence[Mapping[str, Value]]:
+        """What tells its rows from others."""
+        ...
+
+    @property
+    def steps(self) -> int:
+        """Number of steps of its progress."""
+        ...
+
+    def rows(self, tick: Tick) -> Sequence[Mapping[str, Value]]:
+        """Do the work; `tick` is called after each step."""
+        ...
+
+
+P = TypeVar("P", bound=Part)
 
 
 class Ledger:
@@ -63,6 +86,15 @@ class Ledger:
                 texts = {name: _text(row[name]) for name in self._fields}
                 writer.writerow(texts)
                 self._rows[self._key_of(texts)] = texts
+
+    def missing_of(self, parts: Iterable[P]) -> list[P]:
+        """The parts of which a row is missing."""
+        return [part for part in parts if not all(key in self for key in part.keys)]
+
+    def fill(self, parts: Iterable[Part], *, jobs: int, on_tick: OnTick) -> None:
+        """Do what is missing; the rows of every part are on the disk as soon as it is done."""
+        for rows in carried_out([part.rows for part in self.missing_of(parts)], jobs=jobs, on_tick=on_tick):
+            self.add(rows)
 
     def _key_of(self, row: Mapping[str, Value]) -> tuple[str, ...]:
         return tuple(_text(row[name]) for name in self._key)

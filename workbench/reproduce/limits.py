@@ -21,7 +21,7 @@ from pipelines.simulation.channels import rng_of
 from readers.streams import ImageSample, StreamKind
 from workbench.reproduce.conditions import METRES_PER_PX, mission, motion_of, surface_of
 from workbench.reproduce.ledger import Ledger, Value
-from workbench.reproduce.tasks import OnTick, Tick, carried_out
+from workbench.reproduce.tasks import Tick
 
 SIDES_PX = (5, 7, 9, 11, 15, 21, 31)
 NOISES_GREY = (0.0, 2.0, 5.0, 10.0)
@@ -64,6 +64,16 @@ class Case:
             "samples": self.samples,
             "seed": self.seed,
         }
+
+    @property
+    def keys(self) -> list[dict[str, Value]]:
+        """What tells its rows: one for each size of the fragment."""
+        return [self.key(side) for side in SIDES_PX]
+
+    @property
+    def steps(self) -> int:
+        """One for every frame."""
+        return 2 * self.pairs
 
     def rows(self, tick: Tick) -> list[dict[str, Value]]:
         """Count the false peaks of fragments of all sizes."""
@@ -147,18 +157,6 @@ def cases(surfaces: Sequence[str], *, samples: int = SAMPLES, seed: int = 0) -> 
 def ledger(folder: Path) -> Ledger:
     """The results in that folder."""
     return Ledger(folder / "limits.csv", KEY, FIELDS)
-
-
-def fill(wanted: Sequence[Case], results: Ledger, *, jobs: int, on_tick: OnTick) -> None:
-    """Compute what is missing; every case's rows are on the disk as soon as it is done."""
-    missing = missing_of(wanted, results)
-    for rows in carried_out([case.rows for case in missing], jobs=jobs, on_tick=on_tick):
-        results.add(rows)
-
-
-def missing_of(wanted: Sequence[Case], results: Ledger) -> list[Case]:
-    """The cases without results."""
-    return [case for case in wanted if not all(case.key(side) in results for side in SIDES_PX)]
 
 
 def false_rates(case: Case, results: Ledger) -> dict[int, float]:

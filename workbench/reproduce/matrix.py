@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 import hashlib
 import json
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from workbench.reproduce.estimates import estimates, settings_of
 from workbench.reproduce.experiment import BEST, PAPER
 from workbench.reproduce.ledger import Ledger, Value
 from workbench.reproduce.measures import accuracy
-from workbench.reproduce.tasks import OnTick, Tick, carried_out
+from workbench.reproduce.tasks import Tick
 from workbench.settings import settings_values
 
 FRAMES = 240
@@ -50,6 +50,16 @@ class Place:
             "seed": self.seed,
             "settings": hashlib.sha256(text.encode()).hexdigest()[:12],
         }
+
+    @property
+    def keys(self) -> list[dict[str, Value]]:
+        """What tells its rows: one for each preset."""
+        return [self.key(preset) for preset in PRESETS]
+
+    @property
+    def steps(self) -> int:
+        """One for every frame."""
+        return self.frames
 
     def _overrides(self, preset: str) -> tuple[str, ...]:
         return self.overrides if preset == PAPER else ()
@@ -91,21 +101,6 @@ def ledger(folder: Path) -> Ledger:
     return Ledger(folder / "matrix.csv", KEY, FIELDS)
 
 
-def fill(wanted: Sequence[Place], results: Ledger, *, jobs: int, on_tick: OnTick) -> None:
-    """Compute what is missing; every drive's rows are on the disk as soon as it is done."""
-    missing = missing_of(wanted, results)
-    for rows in carried_out([place.rows for place in missing], jobs=jobs, on_tick=on_tick):
-        results.add(rows)
-
-
-def missing_of(wanted: Sequence[Place], results: Ledger) -> list[Place]:
-    """The cells without results."""
-    return [place for place in wanted if not all(place.key(preset) in results for preset in PRESETS)]
-
-
-def rows_of(wanted: Sequence[Place], results: Ledger) -> Iterator[Mapping[str, str]]:
+def rows_of(wanted: Sequence[Place], results: Ledger) -> list[Mapping[str, str]]:
     """The rows of the cells that are done."""
-    for place in wanted:
-        for preset in PRESETS:
-            if place.key(preset) in results:
-                yield results.row(place.key(preset))
+    return [results.row(key) for place in wanted for key in place.keys if key in results]

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
-from typing import Any
 
 from pipelines.simulation.families import FAMILIES
 from workbench.reproduce import correction, experiment, limits, matrix, report
 from workbench.reproduce.conditions import CONDITIONS, FRAMES, surface_of
 from workbench.reproduce.documents import made_folder
+from workbench.reproduce.ledger import Ledger, Part
 from workbench.reproduce.tasks import carried_out
 from workbench.settings import SettingsError
 
@@ -140,10 +140,12 @@ class _Work:
         for run in carried_out(tasks, jobs=self._jobs, on_tick=self._told("experiment", steps)):
             self._runs[run.cell] = run
         self._effects = correction.effects(frames=self._plan.frames)
-        steps = sum(place.frames for place in matrix.missing_of(self._places, self._matrix))
-        matrix.fill(self._places, self._matrix, jobs=self._jobs, on_tick=self._told("matrix", steps))
-        steps = sum(2 * case.pairs for case in limits.missing_of(self._cases, self._limits))
-        limits.fill(self._cases, self._limits, jobs=self._jobs, on_tick=self._told("limits", steps))
+        self._fill("matrix", self._matrix, self._places)
+        self._fill("limits", self._limits, self._cases)
+
+    def _fill(self, what: str, results: Ledger, parts: Sequence[Part]) -> None:
+        steps = sum(part.steps for part in results.missing_of(parts))
+        results.fill(parts, jobs=self._jobs, on_tick=self._told(what, steps))
 
     def results(self) -> report.Results:
         """What is done by now."""
@@ -156,7 +158,7 @@ class _Work:
             seeds=tuple(range(plan.seeds)),
             runs=[self._runs[cell] for cell in self._in_order() if cell in self._runs],
             effects=self._effects,
-            matrix=list(matrix.rows_of(self._places, self._matrix)),
+            matrix=matrix.rows_of(self._places, self._matrix),
             limits={case: rates for case, rates in false.items() if rates},
             logs=[experiment.log_folder(c, plan.out) for c in plan.cells if is_logged(c) and c in self._runs],
             unfinished=list(self._unfinished()),
@@ -165,11 +167,11 @@ class _Work:
     def _in_order(self) -> list[experiment.Cell]:
         return sorted(self._plan.cells, key=lambda cell: (cell.condition.name, cell.seed))
 
-    def _unfinished(self) -> Any:
+    def _unfinished(self) -> Iterator[str]:
         for name, left, wanted in (
             ("experiment", [c for c in self._plan.cells if c not in self._runs], self._plan.cells),
-            ("matrix", matrix.missing_of(self._places, self._matrix), self._places),
-            ("limits", limits.missing_of(self._cases, self._limits), self._cases),
+            ("matrix", self._matrix.missing_of(self._places), self._places),
+            ("limits", self._limits.missing_of(self._cases), self._cases),
         ):
             if left:
                 yield f"{name} ({len(left)} of {len(wanted)} parts are missing)"

@@ -173,8 +173,15 @@ class EurocFolder(FolderTarget):
         if math.isfinite(info.rate_hz):
             lines.append(f"rate_hz: {info.rate_hz!r}")
         if info.kind is StreamKind.IMAGE:
-            lines += self._calibration(info.name)
+            lines += self._mounting(info.name) + self._calibration(info.name)
         (folder / "sensor.yaml").write_text("\n".join(lines) + "\n", encoding="utf-8", newline="\n")
+
+    def _mounting(self, stream: str) -> list[str]:
+        """The lines of sensor.yaml on the transform from camera to body; none where it is not known."""
+        camera = self.order.recording.cameras.get(stream)
+        if camera is None or not np.all(np.isfinite(camera.body_t_camera)):
+            return []
+        return ["T_BS:", "  cols: 4", "  rows: 4", f"  data: {_numbers(*camera.body_t_camera.ravel())}"]
 
     def _calibration(self, stream: str) -> list[str]:
         """The lines of sensor.yaml on the intrinsics; none where they are not known or no plain pinhole's."""

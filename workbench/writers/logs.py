@@ -6,10 +6,11 @@ Messages go in the order in which they were received; the log time is `received_
 from __future__ import annotations
 
 import abc
+import contextlib
 import shutil
 import struct
 from collections.abc import Iterator, Mapping
-from typing import Any, BinaryIO, ClassVar
+from typing import Any, BinaryIO, ClassVar, Literal
 
 from mcap.writer import Writer as McapWriter
 from rosbags.rosbag1 import Writer as Ros1Writer
@@ -178,55 +179,27 @@ class JsonMcap(Mcap):
 # ------------------------------------------------------------------------------------- bags
 
 
-class Ros1Bag(LogTarget):
-    """A ROS 1 bag 2.0, its chunks uncompressed."""
+class RosBag(LogTarget):
+    """A bag that `rosbags` writes."""
+
+    generation: ClassVar[Literal[1, 2]]
 
     def __init__(self, order: Order) -> None:
         super().__init__(order)
-        self._messages = RosMessages(1)
-        self._writer: Ros1Writer | None = None
+        self._messages = RosMessages(self.generation)
+        self._writer: Ros1Writer | Ros2Writer | None = None
+
+    @abc.abstractmethod
+    def _new_writer(self) -> Ros1Writer | Ros2Writer:
+        """A writer that is not opened yet."""
+
+    @abc.abstractmethod
+    def _remove(self) -> None:
+        """Remove what was made."""
 
     def open(self) -> None:
-        """Make the file and write its header."""
-        writer = Ros1Writer(self.path)
-        writer.open()
-        self._writer = writer
-
-    def _message(self, sample: Sample, frame: str) -> tuple[str, str, bytes] | None:
-        return _ros(self._messages, sample, frame)
-
-    def _register(self, topic: str, type_name: str) -> Any:
-        assert self._writer is not None
-        return self._writer.add_connection(topic, type_name, typestore=self._messages.store)
-
-    def _add(self, channel: Any, topic: str, sample: Sample, data: bytes) -> None:
-        assert self._writer is not None
-        self._writer.write(channel, sample.received_ns, data)
-
-    def close(self) -> None:
-        """Write the index."""
-        assert self._writer is not None
-        self._writer.close()
-
-    def discard(self) -> None:
-        """Remove the file."""
-        if self._writer is not None:
-            self._writer.abort()
-            self.path.unlink()
-
-
-class Ros2Bag(LogTarget):
-    """A folder with a ROS 2 bag: sqlite3 storage, which has the folder's name, and metadata.yaml."""
-
-    def __init__(self, order: Order) -> None:
-        super().__init__(order)
-        self._messages = RosMessages(2)
-        self._root = first_missing(self.path)
-        self._writer: Ros2Writer | None = None
-
-    def open(self) -> None:
-        """Make the folder and the database."""
-        self._writer = Ros2Writer(self.path, version=ROS2_VERSION, storage_plugin=StoragePlugin.SQLITE3)
+        """Make the file or folder."""
+        self._writer = self._new_writer()
         self._writer.open()
 
     def _message(self, sample: Sample, frame: str) -> tuple[str, str, bytes] | None:
@@ -241,12 +214,41 @@ class Ros2Bag(LogTarget):
         self._writer.write(channel, sample.received_ns, data)
 
     def close(self) -> None:
-        """Commit the database and write metadata.yaml."""
+        """Write the index, or commit the database and write metadata.yaml."""
         assert self._writer is not None
         self._writer.close()
 
     def discard(self) -> None:
-        """Remove the folder."""
+        """Remove the file or folder."""
         if self._writer is not None:
             self._writer.abort()
-            shutil.rmtree(self._root, ignore_errors=True)
+            with contextlib.suppress(OSError):
+                self._remove()
+
+
+class Ros1Bag(RosBag):
+    """A ROS 1 bag 2.0, its chunks uncompressed."""
+
+    generation = 1
+
+    def _new_writer(self) -> Ros1Writer:
+        return Ros1Writer(self.path)
+
+    def _remove(self) -> None:
+        self.path.unlink()
+
+
+class Ros2Bag(RosBag):
+    """A folder with a ROS 2 bag: sqlite3 storage, which has the folder's name, and metadata.yaml."""
+
+    generation = 2
+
+    def __init__(self, order: Order) -> None:
+        super().__init__(order)
+        self._root = first_missing(self.path)
+
+    def _new_writer(self) -> Ros2Writer:
+        return Ros2Writer(self.path, version=ROS2_VERSION, storage_plugin=StoragePlugin.SQLITE3)
+
+    def _remove(self) -> None:
+        shutil.rmtree(self._root)
