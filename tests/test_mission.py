@@ -129,6 +129,12 @@ def test_a_picture_is_the_view_exposed_as_the_camera_is_set() -> None:
     np.testing.assert_array_equal(camera.picture(12), expected)
 
 
+def test_motion_blur_is_an_exposure_by_share_of_the_frames_interval() -> None:
+    blurred = mission(flaws.MotionBlur(exposure=0.8, **WHILE))
+    longer = dataclasses.replace(mission().on_board[0], exposure_s=0.8 / RATE_HZ)
+    np.testing.assert_array_equal(blurred.frame(12), longer.picture(12))
+
+
 def test_lens_dirt_stays_where_it_is() -> None:
     dirty = mission(flaws.LensDirt(share=1.0, start_s=0, stop_s=3))
     assert np.array_equal(dirty.frame(3), dirty.frame(30))
