@@ -15,7 +15,7 @@ from pipelines.simulation.imaging import CameraOnBoard
 from pipelines.simulation.mission import IMAGE, INFO, SimulatedMission, nadir_mission
 from pipelines.simulation.motion import NADIR, Hold, Mount, looking
 from pipelines.simulation.patches import centres, corners, faded, inside, intervals, overlaps
-from pipelines.simulation.render import view
+from pipelines.simulation.render import expose, noise_key_of, view
 from pipelines.simulation.scene import Patch, Scene
 from pipelines.simulation.speeds import speed
 from pipelines.simulation.surfaces import gravel, tiles
@@ -116,6 +116,23 @@ def test_faults_of_pictures_hold_in_their_interval_only(fault: Fault) -> None:
     clean, faulty = mission(), mission(fault)
     differs = [k for k in range(40) if not np.array_equal(clean.frame(k), faulty.frame(k))]
     assert differs == list(range(10, 20))
+
+
+def test_a_picture_is_the_view_exposed_as_the_camera_is_set() -> None:
+    jump = flaws.ExposureJump(gain=1.2, offset_grey=5.0, **WHILE)
+    camera = dataclasses.replace(
+        mission().on_board[0], exposure_s=0.02, readout_s=0.01, vignetting=0.4, noise_grey=3.0, faults=(jump,)
+    )
+    place = (camera.scene, CAMERA, camera.mount, camera.motion, float(camera.plan.t_s[12]))
+    seen = view(*place, exposure_s=0.02, exposure_samples=15, readout_s=0.01)
+    expected = expose(seen, noise_key=noise_key_of(4, 12), noise_grey=3.0, gain=1.2, offset_grey=5.0, vignetting=0.4)
+    np.testing.assert_array_equal(camera.picture(12), expected)
+
+
+def test_motion_blur_is_an_exposure_by_share_of_the_frames_interval() -> None:
+    blurred = mission(flaws.MotionBlur(exposure=0.8, **WHILE))
+    longer = dataclasses.replace(mission().on_board[0], exposure_s=0.8 / RATE_HZ)
+    np.testing.assert_array_equal(blurred.frame(12), longer.picture(12))
 
 
 def test_lens_dirt_stays_where_it_is() -> None:

@@ -558,6 +558,11 @@ def test_the_height_over_a_relief_is_that_of_the_rendered_ground() -> None:
     mission = made("relief", "frames=40", "ground.size_px=256")
     ranges = [s.range_m for s in mission.read(["/camera/height"]) if isinstance(s, RangeSample)]
     assert 0.0005 < np.std(ranges) < 0.01
+    camera = mission.on_board[0]
+    seen = camera.scene.relief
+    assert seen is not None
+    expected = camera.heights_m - making.height_of(seen, *camera.poses[:, :2].T)
+    np.testing.assert_allclose(ranges, expected, atol=1e-7)
     relief = Relief(0.01, 0.05, seed=3)
     at = np.array([0.1, -0.3, 0.7]), np.array([0.2, 0.5, -0.4])
     step = relief.metres_per_sample
