@@ -73,6 +73,7 @@ class Roster:
         seen_ns: time of the last image point [n].
         first_px: image point at the start or the last reset [n, 2].
         first_turn: `Pose.turn` then [n, 3, 3].
+        most_px: largest derotated parallax since then [n]: a way back does not take from what it told.
     """
 
     ids: Longs
@@ -81,12 +82,13 @@ class Roster:
     seen_ns: Longs
     first_px: Floats
     first_turn: Floats
+    most_px: Floats
 
     @classmethod
     def none(cls) -> Roster:
         """No landmark."""
         whole = np.zeros(0, np.int64)
-        return cls(whole, whole, whole, whole, np.zeros((0, 2)), np.zeros((0, 3, 3)))
+        return cls(whole, whole, whole, whole, np.zeros((0, 2)), np.zeros((0, 3, 3)), np.zeros(0))
 
     def only(self, kept: Longs) -> Roster:
         """Some of the landmarks, by number."""
@@ -97,6 +99,7 @@ class Roster:
             self.seen_ns[kept],
             self.first_px[kept],
             self.first_turn[kept],
+            self.most_px[kept],
         )
 
     def and_also(self, other: Roster) -> Roster:
@@ -108,6 +111,7 @@ class Roster:
             np.concatenate([self.seen_ns, other.seen_ns]),
             np.concatenate([self.first_px, other.first_px]),
             np.concatenate([self.first_turn, other.first_turn]),
+            np.concatenate([self.most_px, other.most_px]),
         )
 
 
@@ -258,10 +262,11 @@ class RangeFilter:
         history = state.history
         if ride is not None:
             history = history.taking(s, update, omega, dt_s)
-        status = statuses(update, max_relative_sigma=s.max_relative_sigma, min_parallax_px=s.min_parallax_px)
+        told = update._replace(derotated_parallax_px=everyone.most_px)
+        status = statuses(told, max_relative_sigma=s.max_relative_sigma, min_parallax_px=s.min_parallax_px)
         age = state.frames - everyone.born
         degrees = 1 if isinstance(sample, LandmarkSample) else 2
-        alarms |= alarms_of_frame(s, update, status, measured, age, trends, history, degrees)
+        alarms |= alarms_of_frame(s, told, status, measured, age, trends, history, degrees)
         if ride is not None and ride.still.any():
             alarms |= Verdict.STANDSTILL
         step = self._record(state, sample, everyone, update, status, measured, driven, ride, alarms, pixel, started)
@@ -371,6 +376,7 @@ class RangeFilter:
             seen_ns=seen_ns,
             first_px=np.where(again[:, None], pixel, roster.first_px),
             first_turn=np.where(again[:, None, None], driven.pose.turn, roster.first_turn),
+            most_px=np.where(again, 0.0, np.fmax(roster.most_px, np.where(seen, update.derotated_parallax_px, 0.0))),
         )
         return roster, state.trends.taking(update), update
 
@@ -493,6 +499,7 @@ class RangeFilter:
             np.full(n, t_ns, np.int64),
             started.points_px.astype(np.float64).reshape(n, 2),
             np.broadcast_to(pose.turn, (n, 3, 3)).copy(),
+            np.zeros(n),
         )
 
     # ------------------------------------------------------------------------------- records

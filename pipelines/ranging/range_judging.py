@@ -137,7 +137,8 @@ def alarms_of_frame(
 
     Args:
         s: the settings.
-        update: of all n landmarks, those that started in this frame among them.
+        update: of all n landmarks, those that started in this frame among them; the derotated parallax is the
+            largest so far.
         status: `Status` [n].
         measured: has an image point [n].
         age_frames: frames since the start [n].
