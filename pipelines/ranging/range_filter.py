@@ -22,6 +22,8 @@ from pipelines.ranging import equations as eq
 from pipelines.ranging.beliefs import Separate, Together
 from pipelines.ranging.ego_motion import Arc
 from pipelines.ranging.filter import Inputs, Outcome, Update, statuses
+from pipelines.ranging.landmarks.settings import LandmarkKind
+from pipelines.ranging.landmarks.sources import source_of
 from pipelines.ranging.range_judging import History, Trends, alarms_of_frame
 from pipelines.ranging.range_settings import MotionModel, RangeSettings, StartKind
 from pipelines.ranging.robot_motion import (
@@ -170,7 +172,7 @@ class RangeFilter:
         source: where the landmarks come from; None: what the settings name.
 
     Raises:
-        EstimatorError: the camera's focal length is unknown.
+        EstimatorError: the camera's focal length is unknown, or its lens model.
     """
 
     name: ClassVar[str] = "range"
@@ -180,12 +182,8 @@ class RangeFilter:
     def __init__(self, settings: RangeSettings, source: LandmarkSource[Any] | None = None) -> None:
         if settings.pinhole_focal_px is None:
             raise EstimatorError("the focal length is unknown: set focal_px, or landmarks = 'bearings'")
-        if source is None:
-            from pipelines.ranging.landmarks import source_of
-
-            source = source_of(settings)
         self._settings = settings
-        self._source = source
+        self._source = source or _source_of(settings)
         self._model = settings.kernel_model
         self._centre = settings.pinhole_centre_px
         self._noise = noise_of(settings)
@@ -221,11 +219,25 @@ class RangeFilter:
             return replace(state, velocities=velocities), None
         if state.frames and sample.stream == state.stream and sample.t_ns <= state.last_ns:
             return self._skip(state, sample)
-        source, sighting = self._source.sight(state.source, sample)
+        source, sighting = self._sighted(state, sample)
         if sighting is None and not (isinstance(sample, Problem) and sample.stream == state.stream):
             return replace(state, source=source), None
         damaged = Verdict.UNDECODABLE if isinstance(sample, Problem) else Verdict.OK
         return self._frame(replace(state, source=source), sample, sighting or NOTHING, damaged)
+
+    def _sighted(self, state: RangeState, sample: Sample) -> tuple[Any, Sighting | None]:
+        """What the source makes of a sample.
+
+        Raises:
+            EstimatorError: the samples are not such as the settings are for.
+        """
+        s = self._settings
+        if isinstance(sample, LandmarkSample) and s.landmarks is LandmarkKind.AUTO and s.focal_px is not None:
+            raise EstimatorError("focal_px is for images and tracks: set landmarks = 'bearings', or leave focal_px out")
+        try:
+            return self._source.sight(state.source, sample)
+        except ValueError as error:
+            raise EstimatorError(str(error)) from error
 
     # ------------------------------------------------------------------------------ one frame
 
@@ -288,9 +300,7 @@ class RangeFilter:
         )
         return after, step
 
-    def _alarms_of_inputs(
-        self, state: RangeState, sample: Sample, moving: bool, first: bool, dt_s: float
-    ) -> Verdict:
+    def _alarms_of_inputs(self, state: RangeState, sample: Sample, moving: bool, first: bool, dt_s: float) -> Verdict:
         s, known = self._settings, state.velocities
         alarms = Verdict.FIRST_FRAME if first else Verdict.OK
         if not moving:
@@ -399,7 +409,8 @@ class RangeFilter:
     def _starts(self, state: RangeState, driven: Driven, seen: Sighting, t_ns: int) -> tuple[Sighting, list[Start]]:
         """Those of the sighted landmarks that start in this frame, as many as there are slots, and their starts."""
         free = self._settings.max_landmarks - len(state.roster.ids)
-        rows, starts = [], []
+        rows: list[int] = []
+        starts: list[Start] = []
         known = set(state.roster.ids.tolist())
         for row, number in enumerate(seen.ids.tolist()):
             if len(starts) == free or number in known:
@@ -409,7 +420,7 @@ class RangeFilter:
                 known.add(number)
                 rows.append(row)
                 starts.append(begun)
-        return Sighting(*(part[rows] for part in seen)), starts
+        return Sighting(seen.ids[rows], seen.points_px[rows], seen.sigma_px[rows]), starts
 
     def _start_of(self, driven: Driven, seen: Sighting, row: int) -> Start | None:
         """The start of one landmark, None while it waits."""
@@ -444,9 +455,7 @@ class RangeFilter:
                 still = self._seen_from(waiting.first_px[None], turn[None])[0]
                 if not np.linalg.norm(seen.points_px[row] - still) >= self._settings.start_parallax_px:
                     return None
-                return start.from_two_views(
-                    self._model, seen.points_px[row], waiting.first_px, noise, waiting.motion
-                )
+                return start.from_two_views(self._model, seen.points_px[row], waiting.first_px, noise, waiting.motion)
         return None
 
     def _from_second_landmark(self, seen: Sighting, row: int, noise: float) -> Start | None:
@@ -483,9 +492,7 @@ class RangeFilter:
         for number, row in row_of.items():
             if number not in taken and len(kept) < s.max_landmarks:
                 noise = float(seen.sigma_px[row] ** 2)
-                kept.append(
-                    Candidate(number, seen.points_px[row], noise, CameraMotion.none(), driven.pose.turn, t_ns)
-                )
+                kept.append(Candidate(number, seen.points_px[row], noise, CameraMotion.none(), driven.pose.turn, t_ns))
         return tuple(kept)
 
     def _enrolled(self, state: RangeState, roster: Roster, started: Sighting, t_ns: int, pose: Pose) -> Roster:
@@ -519,7 +526,9 @@ class RangeFilter:
         started: Sighting,
     ) -> RangeStep:
         s, known = self._settings, state.velocities
-        velocities = np.full((1, 2), np.nan) if ride is None else np.column_stack([ride.omega[:, 1], ride.velocity[:, 2]])
+        velocities = (
+            np.full((1, 2), np.nan) if ride is None else np.column_stack([ride.omega[:, 1], ride.velocity[:, 2]])
+        )
         dt = np.ones(1) if ride is None else ride.dt
         bias = bias_of(s, known) if ride is None else ride.bias_radps
 
@@ -623,6 +632,13 @@ class RangeFilter:
             focus_distance_px=none(),
         )
         return replace(state, frames=state.frames + 1), step
+
+
+def _source_of(settings: RangeSettings) -> LandmarkSource[Any]:
+    try:
+        return source_of(settings, settings.camera, surveyed=settings.only_landmarks or None)
+    except ValueError as error:
+        raise EstimatorError(str(error)) from error
 
 
 def _mean(dt: Floats, values: Floats) -> float:

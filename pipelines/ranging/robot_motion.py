@@ -72,10 +72,10 @@ class Velocities:
     """
 
     rest: Rest
-    speed: Signal = Signal()  # noqa: RUF009 (a tuple)
-    wheels: Signal = Signal()  # noqa: RUF009
-    gyro: Signal = Signal()  # noqa: RUF009
-    window: Signal = Signal()  # noqa: RUF009
+    speed: Signal = Signal()
+    wheels: Signal = Signal()
+    gyro: Signal = Signal()
+    window: Signal = Signal()
     disorder: bool = False
     unusable: bool = False
 
@@ -132,9 +132,9 @@ def noise_of(s: RangeSettings) -> Noise:
         )
     across = [s.sigma_omega if s.sigma_omega_across is None else s.sigma_omega_across] * 2
     aside = [s.sigma_speed if s.sigma_speed_across is None else s.sigma_speed_across] * 2
-    columns = [*turns, *speeds, _turning(s, x), _turning(s, y), _driving(s, y), _driving(s, z)]
+    others = [_turning(s, x), _turning(s, y), _driving(s, y), _driving(s, z)]
     return Noise(
-        np.stack(columns, axis=1),
+        np.stack(turns + speeds + others, axis=1),
         np.array([s.sigma_omega, s.sigma_speed, *across, *aside]) ** 2,
         np.array([False, True, False, False, True, True]),
     )
@@ -259,7 +259,10 @@ def ridden(s: RangeSettings, known: Velocities, last_ns: int, t_ns: int) -> tupl
     turn = turn_signal(s, known)
     # what comes after the frame (messages of the same time, or a disordered log) is for the next one
     found = intervals(
-        *_arrays(turn, last_ns), *_arrays(known.speed, last_ns), np.array([0.0, (t_ns - last_ns) * NS]), s.synchronisation
+        *_arrays(turn, last_ns),
+        *_arrays(known.speed, last_ns),
+        np.array([0.0, (t_ns - last_ns) * NS]),
+        s.synchronisation,
     )
     raw, velocity, still = found.omega.T, found.speed[:3].T, found.speed[3] == 1.0
     rest = _rested(s, known.rest, raw, still, found.dt) if turn is known.gyro else known.rest
@@ -273,8 +276,9 @@ def ridden(s: RangeSettings, known: Velocities, last_ns: int, t_ns: int) -> tupl
         unusable=False,
     )
     bias = bias_of(s, kept)
-    turned = s.synchronisation is not Synchronisation.AS_PRINTED or raw.any(axis=1)[:, None]
-    omega = np.where(turned, raw - bias, 0.0)
+    # as printed, there is no rate of turn at all in an interval without a message of the gyro
+    turned = np.asarray(raw.any(axis=1) | (s.synchronisation is not Synchronisation.AS_PRINTED))
+    omega = np.where(turned[:, None], raw - bias, 0.0)
     velocity = np.where(still[:, None], 0.0, velocity)
     return kept, Ride(found.dt, *_at_camera(s, omega, velocity), still, bias)
 
