@@ -17,7 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.estimator import EstimatorError
-from pipelines.ranging import ego_motion, joint, start
+from pipelines.ranging import ego_motion, start
 from pipelines.ranging import equations as eq
 from pipelines.ranging.beliefs import Separate, Together
 from pipelines.ranging.ego_motion import Arc
@@ -321,39 +321,32 @@ class RangeFilter:
     def _driven(self, state: RangeState, ride: Ride | None) -> Driven:
         """Carry landmarks, pose and candidates over every interval since the last frame (23), (24)."""
         n = len(state.roster.ids)
-        belief, pose, candidates = state.belief, state.pose, state.candidates
-        a, g = np.full((n, 3, 3), np.nan), np.full((n, 3, 2), np.nan)
         if ride is None:
-            return Driven(belief, pose, candidates, a, g, None)
-        last, again = len(ride.dt) - 1, self._model.relinearisations > 0
-        for k in range(len(ride.dt)):
-            arc = ego_motion.arc(ride.omega[k], ride.velocity[k], ride.dt[k])
-            pose = pose.after(arc)
-            candidates = tuple(c._replace(motion=self._candidate_motion(c.motion, ride, k)) for c in candidates)
-            if again and k == last:
-                break
-            ahead, a, g = self._predicted(belief.mean, ride, k, arc)
-            belief = belief.carried(ahead, a, g, self._input_variance(ride, k))
-        inputs = Inputs(ride.omega[-1, 1], ride.velocity[-1, 2], ride.dt[-1], bool(ride.still[-1])) if again else None
-        return Driven(belief, pose, candidates, a, g[..., :2], inputs)
-
-    def _predicted(self, mean: Floats, ride: Ride, k: int, arc: Arc) -> tuple[Floats, Floats, Floats]:
-        """X⁻, A and G over one interval, G by the columns of the inputs' noise."""
-        if self._settings.motion is not MotionModel.ALIGNED:
-            ahead, a, g = ego_motion.predicted(self._model, mean, arc)
-            return ahead, a, g @ self._noise.columns
-        ahead, a, g = mean.copy(), np.empty((len(mean), 3, 3)), np.empty((len(mean), 3, 2))
-        joint.linearise_all(self._model, ahead, ride.omega[k, 1], ride.velocity[k, 2], ride.dt[k], a, g)
-        return ahead, a, g
-
-    def _input_variance(self, ride: Ride, k: int) -> Floats:
-        """The diagonal of Q_c / dt (24); 0 for the speeds of a robot that stands."""
-        variance = self._noise.density / ride.dt[k]
-        return np.where(self._noise.speeds & ride.still[k], 0.0, variance)
-
-    def _candidate_motion(self, motion: CameraMotion, ride: Ride, k: int) -> CameraMotion:
-        q_omega, q_speed = self._input_variance(ride, k)[:2]
-        return motion.then(eq.held(ride.omega[k, 1], ride.velocity[k, 2], ride.dt[k]), q_omega, q_speed)
+            none = np.full((n, 3, 3), np.nan)
+            return Driven(state.belief, state.pose, state.candidates, none, none[..., :2], None)
+        variance = self._noise.density / ride.dt[:, None]
+        variance[np.ix_(ride.still, self._noise.speeds)] = 0.0  # a robot that stands has no error of speed
+        again = self._model.relinearisations > 0
+        stop = len(ride.dt) - again
+        out = ego_motion.carried(
+            self._model,
+            state.belief.mean,
+            state.belief.pairs,
+            *state.pose,
+            dt=ride.dt[:stop],
+            omega=ride.omega[:stop],
+            velocity=ride.velocity[:stop],
+            columns=self._noise.columns,
+            q=variance[:stop],
+            aligned=self._settings.motion is MotionModel.ALIGNED,
+        )
+        pose, inputs = Pose(out.turn, out.shift_m), None
+        if again:
+            pose = pose.after(ego_motion.arc(ride.omega[-1], ride.velocity[-1], ride.dt[-1]))
+            inputs = Inputs(ride.omega[-1, 1], ride.velocity[-1, 2], ride.dt[-1], bool(ride.still[-1]))
+        candidates = tuple(c._replace(motion=_continued(c.motion, ride, variance)) for c in state.candidates)
+        belief = state.belief.carried(out.mean, out.pairs)
+        return Driven(belief, pose, candidates, out.transition, out.noise_gain[..., :2], inputs)
 
     def _updated(self, driven: Driven, pixel: Floats, variance: Floats) -> tuple[Separate | Together, Update]:
         """Gate and update (25)-(27); A and G are those of the last interval."""
@@ -639,6 +632,14 @@ def _source_of(settings: RangeSettings) -> LandmarkSource[Any]:
         return source_of(settings, settings.camera, surveyed=settings.only_landmarks or None)
     except ValueError as error:
         raise EstimatorError(str(error)) from error
+
+
+def _continued(motion: CameraMotion, ride: Ride, variance: Floats) -> CameraMotion:
+    """A motion, followed by the intervals of a frame."""
+    for k in range(len(ride.dt)):
+        held = eq.held(ride.omega[k, 1], ride.velocity[k, 2], ride.dt[k])
+        motion = motion.then(held, variance[k, 0], variance[k, 1])
+    return motion
 
 
 def _mean(dt: Floats, values: Floats) -> float:
