@@ -28,6 +28,10 @@ TERMS = 40
 """Of the series of the sines' quotients: exact to rounding up to turns of about 10 rad within one interval."""
 
 
+BESIDE = 0.01
+"""Cosine of the angle from the optical axis (89.4°) beyond which a landmark counts as behind: its image runs away."""
+
+
 class Arc(NamedTuple):
     """The camera's motion over an interval of constant velocities.
 
@@ -99,7 +103,7 @@ def linearise_all(model, mean, turn, shift, reach, turn_by, shift_by, a, g):  # 
     """Predict `mean` [n, 3] in place; fill A = ∂X'/∂X [n, 3, 3] and G = ∂X'/∂(Δω, Δv) [n, 3, 6], camera axes.
 
     The true velocities are the measured ones minus their errors, so G is minus the derivative by the velocities.
-    What comes behind the camera is NaN.
+    What comes behind the camera, or quite beside it, is NaN.
     """
     f, cx, cy = model.focal_px, model.centre_x_px, model.centre_y_px
     ray, slope, d = np.ones(3), np.empty((3, 9)), np.empty(3)
@@ -107,7 +111,7 @@ def linearise_all(model, mean, turn, shift, reach, turn_by, shift_by, a, g):  # 
         xi = mean[i, 2]
         ray[0], ray[1] = (mean[i, 0] - cx) / f, (mean[i, 1] - cy) / f
         h = turn @ ray - xi * shift
-        if not (xi > 0.0 and h[2] > 0.0 and np.isfinite(h[2])):
+        if not (xi > 0.0 and h[2] > BESIDE * np.sqrt(h @ h)):
             mean[i], a[i], g[i] = np.nan, np.nan, np.nan
             continue
         slope[:, 0], slope[:, 1], slope[:, 2] = turn[:, 0] / f, turn[:, 1] / f, -shift

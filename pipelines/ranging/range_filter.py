@@ -367,12 +367,13 @@ class RangeFilter:
         outcome = np.where(unseen, int(Outcome.LOST), update.outcome)
         place = update.mean[:, :2]
         without_way = self._seen_from(roster.first_px, driven.pose.turn @ roster.first_turn.swapaxes(1, 2))
-        update = update._replace(
-            outcome=outcome,
-            parallax_px=np.linalg.norm(place - roster.first_px, axis=1),
-            derotated_parallax_px=np.linalg.norm(place - without_way, axis=1),
-            focus_distance_px=np.linalg.norm(place - self._focus(ride), axis=1),
-        )
+        with np.errstate(over="ignore"):  # the image point of what comes beside the camera runs to infinity
+            update = update._replace(
+                outcome=outcome,
+                parallax_px=np.linalg.norm(place - roster.first_px, axis=1),
+                derotated_parallax_px=np.linalg.norm(place - without_way, axis=1),
+                focus_distance_px=np.linalg.norm(place - self._focus(ride), axis=1),
+            )
         again = outcome == Outcome.RESET
         roster = replace(
             roster,
