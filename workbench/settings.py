@@ -80,7 +80,14 @@ def _correlation() -> Plugin:
     return Plugin("correlation", CorrelationSettings, CorrelationOdometry)
 
 
-BUILT_IN: Mapping[str, Callable[[], Plugin]] = {"correlation": _correlation}
+def _range() -> Plugin:
+    from pipelines.ranging.range_filter import RangeFilter
+    from pipelines.ranging.range_settings import RangeSettings
+
+    return Plugin("range", RangeSettings, RangeFilter)
+
+
+BUILT_IN: Mapping[str, Callable[[], Plugin]] = {"correlation": _correlation, "range": _range}
 
 
 def estimator_names() -> tuple[str, ...]:
