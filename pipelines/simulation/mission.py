@@ -22,7 +22,7 @@ from pipelines.lens import pinhole
 from pipelines.simulation.channels import Channel, Longs
 from pipelines.simulation.faults import Fault
 from pipelines.simulation.imaging import OF_IMAGES, CameraOnBoard
-from pipelines.simulation.motion import Motion, Mount, Waypoints
+from pipelines.simulation.motion import Hold, Motion, Mount, Waypoints
 from pipelines.simulation.patches import OF_GROUND, faults_met, patches_of
 from pipelines.simulation.scene import Scene
 from pipelines.simulation.sensors import (
@@ -37,7 +37,16 @@ from pipelines.simulation.sensors import (
 from pipelines.simulation.sensors import HEIGHT as RANGE
 from pipelines.simulation.surfaces import Surface
 from pipelines.simulation.timing import Timing, schedule
-from readers.streams import Camera, CameraInfo, Recording, Sample, StreamError, StreamInfo
+from readers.streams import (
+    Camera,
+    CameraInfo,
+    Landmark,
+    Recording,
+    Sample,
+    StreamError,
+    StreamInfo,
+    unknown_transform,
+)
 
 Floats = NDArray[np.float64]
 
@@ -57,6 +66,8 @@ class SimulatedMission(Recording):
         motion: how the vehicle moves.
         cameras: the cameras on board; frames and poses of the truth are those of the first one.
         faults: what goes wrong, as it really happens.
+        landmarks_m: places of the points that are tracked [n, 3]; their numbers are those of the tracks.
+        pose_point_m: the point of the body whose poses the mission tells, in body axes [3].
         description: what the mission is made of, in values that JSON has; equal missions have equal ones.
 
     Attributes:
@@ -79,10 +90,14 @@ class SimulatedMission(Recording):
         motion: Motion,
         cameras: Sequence[CameraOnBoard] = (),
         faults: Sequence[Fault] = (),
+        landmarks_m: ArrayLike = (),
+        pose_point_m: ArrayLike = (0.0, 0.0, 0.0),
         description: Mapping[str, Any],
     ) -> None:
         self.path, self.start_ns, self.motion = Path(name), start_ns, motion
         self.on_board, self.faults, self.description = tuple(cameras), tuple(faults), dict(description)
+        self._landmarks_m = np.array(landmarks_m, dtype=np.float64).reshape(-1, 3)
+        self._pose_point_m = np.array(pose_point_m, dtype=np.float64)
         self._channels = {channel.stream: channel for channel in channels}
         if len(self._channels) != len(channels):
             raise ValueError(f"{name}: two channels have the same name: {[channel.stream for channel in channels]}")
@@ -125,14 +140,31 @@ class SimulatedMission(Recording):
 
     @property
     def cameras(self) -> dict[str, Camera]:
-        """The calibration that each camera sends first."""
+        """The calibration that each camera sends first, with the place of a rigidly fixed one in the body.
+
+        The body's origin is the point whose poses the mission tells.
+        """
         sent: dict[str, Camera] = {}
         for camera in self.on_board:
             info = self._channels.get(info_stream_of(camera.stream))
             if info is not None and len(info.number):
                 first = info.sample(int(info.number[0]), int(info.stamp_ns[0]), int(info.received_ns[0]))
-                sent[camera.stream] = first.camera if isinstance(first, CameraInfo) else camera.camera
+                known = first.camera if isinstance(first, CameraInfo) else camera.camera
+                sent[camera.stream] = dataclasses.replace(known, body_t_camera=self._body_t_camera(camera.mount))
         return sent
+
+    def _body_t_camera(self, mount: Mount) -> Floats:
+        """Where a camera sits [4, 4]; NaN where it turns in the body."""
+        if mount.hold is not Hold.RIGID:
+            return unknown_transform()
+        body_t_camera = np.eye(4)
+        body_t_camera[:3, :3], body_t_camera[:3, 3] = mount.body_r_camera, mount.position_m - self._pose_point_m
+        return body_t_camera
+
+    @property
+    def landmarks(self) -> dict[int, Landmark]:
+        """The points that are tracked, by the numbers of their tracks; their places are exact."""
+        return {k: Landmark(position_m=place, sigma_m=np.zeros(3)) for k, place in enumerate(self._landmarks_m)}
 
     def read(
         self,

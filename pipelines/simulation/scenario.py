@@ -159,6 +159,10 @@ def build(scenario: Scenario, *, picture: ArrayLike | None = None) -> SimulatedM
         motion=motion,
         cameras=cameras,
         faults=faults,
+        landmarks_m=() if scenario.tracks is None else landmarks_of(scenario.surroundings),
+        pose_point_m=(0.0, 0.0, 0.0)
+        if scenario.reference is None
+        else _at_camera(scenario.reference, scenario).point_m,
         description=values,
     )
 
