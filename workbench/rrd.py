@@ -33,6 +33,7 @@ from rerun.chunk import RrdReader
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
 from pipelines.geometry import heading_of_quat
+from pipelines.ranging.step import RangeStep
 from pipelines.verdict import Severity, Verdict
 from readers.streams import ImageError, ImageSample, PoseSample, RecordingError
 from workbench import traces
@@ -53,6 +54,7 @@ from workbench.rrd_file import (
     marker,
     texts,
 )
+from workbench.rrd_ranges import RangeDrawing
 from workbench.schema import Archetype, Row, Schema, schema_of
 
 if TYPE_CHECKING:
@@ -65,7 +67,7 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-_DRAWINGS: Mapping[type[Step], type[Drawing]] = {CorrelationStep: CorrelationDrawing}
+_DRAWINGS: Mapping[type[Step], type[Drawing]] = {CorrelationStep: CorrelationDrawing, RangeStep: RangeDrawing}
 
 
 class _Writer(abc.ABC):
