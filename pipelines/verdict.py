@@ -49,6 +49,24 @@ class Verdict(enum.IntFlag):
     SIZE_CHANGED = 1 << 20
     UNDECODABLE = 1 << 21
     LOST = 1 << 22
+    LANDMARK_REJECTED = 1 << 23
+    LANDMARK_RESET = 1 << 24
+    LANDMARK_LOST = 1 << 25
+    NO_LANDMARKS = 1 << 26
+    RANGE_UNKNOWN = 1 << 27
+    LOW_PARALLAX = 1 << 28
+    NEAR_FOCUS = 1 << 29
+    PURE_ROTATION = 1 << 30
+    STANDSTILL = 1 << 31
+    NIS_HIGH = 1 << 32
+    NIS_LOW = 1 << 33
+    INNOVATIONS_ONE_SIDED = 1 << 34
+    INNOVATIONS_ALTERNATE = 1 << 35
+    INNOVATIONS_FOLLOW_TURN = 1 << 36
+    INPUT_STALE = 1 << 37
+    INPUT_MISSING = 1 << 38
+    INPUT_OUT_OF_ORDER = 1 << 39
+    INPUT_UNREADABLE = 1 << 40
 
     @property
     def sentence(self) -> str:
@@ -86,6 +104,24 @@ _SENTENCES: dict[Verdict, str] = {
     Verdict.SIZE_CHANGED: "the image size differs from that of the frame before",
     Verdict.UNDECODABLE: "the image could not be decoded",
     Verdict.LOST: "no position: the last velocity is held until the global search succeeds",
+    Verdict.LANDMARK_REJECTED: "an image point lies outside the gate of its landmark and was not used",
+    Verdict.LANDMARK_RESET: "a landmark's image points were rejected several times in a row: its range starts again",
+    Verdict.LANDMARK_LOST: "a landmark was given up: it was not seen for long, or came behind the camera",
+    Verdict.NO_LANDMARKS: "no landmark has an image point in this frame",
+    Verdict.RANGE_UNKNOWN: "no landmark's range counts yet",
+    Verdict.LOW_PARALLAX: "the way has hardly moved any landmark on the image: the ranges are those of the start",
+    Verdict.NEAR_FOCUS: "a landmark lies near the focus of expansion, where driving tells nothing of its range",
+    Verdict.PURE_ROTATION: "the landmarks moved on the image by rotation alone, which tells nothing of their ranges",
+    Verdict.STANDSTILL: "the camera stands: the ranges stay as they are",
+    Verdict.NIS_HIGH: "the innovations are larger than the filter expects: noise settings, start, stamps or inputs",
+    Verdict.NIS_LOW: "the innovations are smaller than the filter expects: its noise settings are too large",
+    Verdict.INNOVATIONS_ONE_SIDED: "a landmark's innovations keep one sign: its start is wrong and trusted too much",
+    Verdict.INNOVATIONS_ALTERNATE: "a landmark's innovations alternate in sign: stamps or frames are swapped",
+    Verdict.INNOVATIONS_FOLLOW_TURN: "the innovations in x follow the rate of turn: the images' stamps are off",
+    Verdict.INPUT_STALE: "the last speed or rate of turn is old; it is held",
+    Verdict.INPUT_MISSING: "there is no speed or no rate of turn yet: landmarks cannot be carried on",
+    Verdict.INPUT_OUT_OF_ORDER: "a speed or rate of turn came with a stamp before that of an earlier one",
+    Verdict.INPUT_UNREADABLE: "a message with a speed or rate of turn could not be used",
 }
 
 _SEVERITIES: dict[Verdict, Severity] = {
@@ -99,6 +135,12 @@ _SEVERITIES: dict[Verdict, Severity] = {
     Verdict.SIZE_CHANGED: Severity.ERROR,
     Verdict.UNDECODABLE: Severity.ERROR,
     Verdict.LOST: Severity.ERROR,
+    Verdict.LANDMARK_LOST: Severity.NOTICE,
+    Verdict.RANGE_UNKNOWN: Severity.NOTICE,
+    Verdict.LOW_PARALLAX: Severity.NOTICE,
+    Verdict.NEAR_FOCUS: Severity.NOTICE,
+    Verdict.STANDSTILL: Severity.NOTICE,
+    Verdict.INPUT_MISSING: Severity.ERROR,
 }
 
 

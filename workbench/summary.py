@@ -43,6 +43,19 @@ ADVICE: Mapping[Verdict, str] = {
     Verdict.SIZE_CHANGED: "the image size changes within the stream",
     Verdict.UNDECODABLE: "images are damaged",
     Verdict.LOST: "the search does not lock; the path there is the last velocity held on, not a measurement",
+    Verdict.LANDMARK_REJECTED: "blunders of the tracks, or a point that is not where the filter expects it",
+    Verdict.LANDMARK_RESET: "tracks slip from one point to another, or the motion is not that of the inputs",
+    Verdict.NO_LANDMARKS: "nothing is tracked there",
+    Verdict.PURE_ROTATION: "the robot turns on the spot: drive to get ranges",
+    Verdict.NIS_HIGH: "raise pixel_sigma, sigma_omega or sigma_speed, and check stamps, calibration and mounting",
+    Verdict.NIS_LOW: "lower pixel_sigma, sigma_omega or sigma_speed",
+    Verdict.INNOVATIONS_ONE_SIDED: "the start is wrong: a broad start finds the range by itself",
+    Verdict.INNOVATIONS_ALTERNATE: "frames or stamps are swapped",
+    Verdict.INNOVATIONS_FOLLOW_TURN: "images come with late or early stamps: shift them",
+    Verdict.INPUT_STALE: "the odometry or the IMU has gaps",
+    Verdict.INPUT_MISSING: "no odometry or no rate of turn at the start",
+    Verdict.INPUT_OUT_OF_ORDER: "stamps of the odometry or the IMU go backwards",
+    Verdict.INPUT_UNREADABLE: "messages of the odometry or the IMU are damaged",
 }
 
 CIRCUMSTANCES = Verdict.DUPLICATE_FRAME | Verdict.FRAME_GAP | Verdict.HEIGHT_CHANGE | Verdict.EXPOSURE_JUMP

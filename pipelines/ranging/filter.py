@@ -40,7 +40,9 @@ class Outcome(IntEnum):
     RESET = kernels.RESET
     """The last of several rejections in a row: the image point is taken, the range becomes uncertain."""
     LOST = kernels.LOST
-    """It passed behind the camera."""
+    """It passed behind the camera, or was not seen for long."""
+    STARTED = 5
+    """Its first image point: there is nothing to update yet."""
 
 
 class Status(IntEnum):

@@ -1,0 +1,135 @@
+"""The exact flow for any motion of the camera: six velocities held over an interval.
+
+A fixed point moves in the camera's axes by Ṗ = -ω × P - v. With constant ω and v over dt, θ = -ω dt,
+
+    P' = E P - b,    E = exp [θ]×,    b = B v,    B = dt (I + k [θ]× + m [θ]×²),
+
+k = (1 - cos |θ|)/|θ|², m = (|θ| - sin |θ|)/|θ|³. With the ray r = (u/f, v/f, 1) and P = r/ξ the image point and
+the inverse depth follow from h = E r - ξ b: x' = c + f h_x/h_z, ξ' = ξ/h_z, a homography. For ω = (0, ω, 0) and
+v = (0, 0, V) this is `equations.exact_flow`, with its A and G.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import numpy as np
+from numba import njit
+from numpy.typing import NDArray
+
+from pipelines.ranging.settings import Model
+
+Floats = NDArray[np.float64]
+
+_jit: Any = njit(cache=True, nogil=True, error_model="numpy")
+
+TERMS = 40
+"""Of the series of the sines' quotients: exact to rounding up to turns of about 10 rad within one interval."""
+
+
+class Arc(NamedTuple):
+    """The camera's motion over an interval of constant velocities.
+
+    Attributes:
+        turn: E [3, 3].
+        shift_m: b [3].
+        reach_s: B [3, 3], the derivative of b with respect to v, s.
+        turn_by: derivatives of E with respect to ω_x, ω_y, ω_z [3, 3, 3], s.
+        shift_by: derivatives of b with respect to ω, by columns [3, 3], m s.
+    """
+
+    turn: Floats
+    shift_m: Floats
+    reach_s: Floats
+    turn_by: Floats
+    shift_by: Floats
+
+
+@_jit
+def _cross(a):  # type: ignore[no-untyped-def]
+    """[a]× [3, 3]."""
+    return np.array([[0.0, -a[2], a[1]], [a[2], 0.0, -a[0]], [-a[1], a[0], 0.0]])
+
+
+@_jit
+def _series(q, first):  # type: ignore[no-untyped-def]
+    """Σ (-q)ⁿ/(2n + first)! and its derivative by q: sin √q/√q for first = 1, k for 2, m for 3."""
+    term = 1.0
+    for i in range(2, first + 1):
+        term /= i
+    total, slope = term, 0.0
+    for n in range(1, TERMS):
+        over = 1.0 / ((2 * n + first - 1) * (2 * n + first))
+        slope -= n * term * over
+        term *= -q * over
+        total += term
+    return total, slope
+
+
+@_jit
+def _arc(omega, velocity, dt):  # type: ignore[no-untyped-def]
+    theta = -omega * dt
+    t = _cross(theta)
+    tt = t @ t
+    q = theta @ theta
+    s, s_q = _series(q, 1)
+    k, k_q = _series(q, 2)
+    m, m_q = _series(q, 3)
+    one = np.eye(3)
+    turn = one + s * t + k * tt
+    reach = dt * (one + k * t + m * tt)
+    turn_by, shift_by = np.empty((3, 3, 3)), np.empty((3, 3))
+    for i in range(3):
+        e = _cross(one[i])
+        both = e @ t + t @ e
+        along = 2.0 * theta[i]
+        turn_by[i] = -dt * (along * (s_q * t + k_q * tt) + s * e + k * both)
+        shift_by[:, i] = (-dt * dt * (along * (k_q * t + m_q * tt) + k * e + m * both)) @ velocity
+    return turn, reach @ velocity, reach, turn_by, shift_by
+
+
+def arc(omega_radps: Floats, velocity_mps: Floats, dt_s: float) -> Arc:
+    """The motion over an interval in which ω [3] and v [3], in camera axes, are constant."""
+    return Arc(*_arc(np.ascontiguousarray(omega_radps), np.ascontiguousarray(velocity_mps), float(dt_s)))
+
+
+@_jit
+def linearise_all(model, mean, turn, shift, reach, turn_by, shift_by, a, g):  # type: ignore[no-untyped-def]
+    """Predict `mean` [n, 3] in place; fill A = ∂X'/∂X [n, 3, 3] and G = ∂X'/∂(Δω, Δv) [n, 3, 6], camera axes.
+
+    The true velocities are the measured ones minus their errors, so G is minus the derivative by the velocities.
+    What comes behind the camera is NaN.
+    """
+    f, cx, cy = model.focal_px, model.centre_x_px, model.centre_y_px
+    ray, slope, d = np.ones(3), np.empty((3, 9)), np.empty(3)
+    for i in range(len(mean)):
+        xi = mean[i, 2]
+        ray[0], ray[1] = (mean[i, 0] - cx) / f, (mean[i, 1] - cy) / f
+        h = turn @ ray - xi * shift
+        if not (xi > 0.0 and h[2] > 0.0 and np.isfinite(h[2])):
+            mean[i], a[i], g[i] = np.nan, np.nan, np.nan
+            continue
+        slope[:, 0], slope[:, 1], slope[:, 2] = turn[:, 0] / f, turn[:, 1] / f, -shift
+        for j in range(3):
+            slope[:, 3 + j] = xi * shift_by[:, j] - turn_by[j] @ ray
+            slope[:, 6 + j] = xi * reach[:, j]
+        over = 1.0 / h[2]
+        u, v, ahead = h[0] * over, h[1] * over, xi * over
+        mean[i, 0], mean[i, 1], mean[i, 2] = cx + f * u, cy + f * v, ahead
+        for j in range(9):
+            d[0] = f * over * (slope[0, j] - u * slope[2, j])
+            d[1] = f * over * (slope[1, j] - v * slope[2, j])
+            d[2] = -ahead * over * slope[2, j]
+            if j == 2:
+                d[2] += over
+            if j < 3:
+                a[i, :, j] = d
+            else:
+                g[i, :, j - 3] = d
+
+
+def predicted(model: Model, mean: Floats, motion: Arc) -> tuple[Floats, Floats, Floats]:
+    """State ahead [n, 3], A [n, 3, 3] and G [n, 3, 6] of landmarks [n, 3]; NaN for those that came behind."""
+    ahead, a, g = mean.copy(), np.empty((len(mean), 3, 3)), np.empty((len(mean), 3, 6))
+    linearise_all(model, ahead, *motion, a, g)
+    return ahead, a, g
