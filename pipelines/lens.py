@@ -104,25 +104,26 @@ def rays(camera: Camera, pixels: Floats) -> Floats:
         ValueError: a pixel that the distortion model does not reach; a camera without a calibration, or
             with an unknown model.
     """
-    lens = _lens_of(camera)
-    goal = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.matrix).T[:, :2]
-    flat = _radially_undistorted(lens, goal)
-    for _ in range(20):
-        distorted, jacobian = _distort(lens, flat)
-        missing = goal - distorted
-        if np.all(np.abs(missing) <= TOLERANCE * (1 + np.abs(goal))):
-            break
-        with np.errstate(all="ignore"):
-            flat = flat + _solved(jacobian, missing)
-    good = np.all(np.abs(missing) <= TOLERANCE * (1 + np.abs(goal)), axis=1)
-    good &= np.hypot(flat[:, 0], flat[:, 1]) <= _reach(lens)
+    found, good = _rays(camera, pixels)
     if not np.all(good):
         u, v = pixels[np.flatnonzero(~good)[0]]
         raise ValueError(
             f"no ray of the {camera.distortion_model} model leads to pixel ({u:g}, {v:g}), which its distortion "
             f"{camera.distortion.tolist()} does not reach; take a weaker distortion or a smaller image"
         )
-    return np.column_stack([flat, np.ones(len(flat))])
+    return found
+
+
+def rays_where_known(camera: Camera, pixels: Floats) -> Floats:
+    """As `rays`, but NaN for a pixel that the distortion model does not reach, or that is not finite.
+
+    Raises:
+        ValueError: a camera without a calibration, or with an unknown model.
+    """
+    finite = np.all(np.isfinite(pixels), axis=1)
+    found, good = _rays(camera, np.where(finite[:, None], pixels, camera.matrix[:2, 2]))
+    found[~(good & finite)] = np.nan
+    return found
 
 
 def ray_table(camera: Camera) -> tuple[Floats, NDArray[np.float32]]:
@@ -142,6 +143,23 @@ def ray_table(camera: Camera) -> tuple[Floats, NDArray[np.float32]]:
 def undistorted(camera: Camera) -> bool:
     """Whether pixels are straight images of rays: a plain pinhole, whatever its model is called."""
     return camera.distortion_model != "equidistant" and not np.any(camera.distortion)
+
+
+def _rays(camera: Camera, pixels: Floats) -> tuple[Floats, NDArray[np.bool_]]:
+    """Rays (x, y, 1) [n, 3] of pixels [n, 2], and which of them lead to their pixels [n]."""
+    lens = _lens_of(camera)
+    goal = np.column_stack([pixels, np.ones(len(pixels))]) @ np.linalg.inv(camera.matrix).T[:, :2]
+    flat = _radially_undistorted(lens, goal)
+    for _ in range(20):
+        distorted, jacobian = _distort(lens, flat)
+        missing = goal - distorted
+        if np.all(np.abs(missing) <= TOLERANCE * (1 + np.abs(goal))):
+            break
+        with np.errstate(all="ignore"):
+            flat = flat + _solved(jacobian, missing)
+    good = np.all(np.abs(missing) <= TOLERANCE * (1 + np.abs(goal)), axis=1)
+    good &= np.hypot(flat[:, 0], flat[:, 1]) <= _reach(lens)
+    return np.column_stack([flat, np.ones(len(flat))]), good
 
 
 def _padded(model: str, coefficients: Floats) -> Floats:
