@@ -91,7 +91,7 @@ class RangeDrawing(Drawing):
         return {"image_px": self.scene.image_px, "landmarks": self._landmarks()}
 
     def bytes_a_step(self, table: traces.Columns) -> int:  # noqa: D102
-        return 4096 + 1200 * int(table["landmark_id"].shape[1])
+        return 512 + 150 * int(table["landmark_id"].shape[1])  # an eighth: numbers are dear to send, not to hold
 
     # ---- what is logged with every step
 
