@@ -147,7 +147,7 @@ def range_blueprint(run: str, estimator: str = "range", bounds: Bounds | None = 
                                contents=drawn),
                         _image("/camera/image", bounds.image_px, "Ranges: 0.5 m red to 50 m blue", contents=ranged),
                     ),
-                    _map(run, bounds.extent, "Map: camera blue, surveyed green, landmarks by status", ()),
+                    _map(run, bounds.extent, "Map: camera blue, surveyed white, landmarks by status", ()),
                 ),
                 _landmark_plots(root, bounds),
                 column_shares=[2, 3],

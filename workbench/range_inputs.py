@@ -172,14 +172,16 @@ def camera_of(recording: Recording, streams: Streams) -> Camera | None:
     return None
 
 
-def with_camera(resolved: Resolved, camera: Camera | None, streams: Streams) -> tuple[Resolved, list[str]]:
+def with_camera(
+    resolved: Resolved, recording: Recording, camera: Camera | None, streams: Streams
+) -> tuple[Resolved, list[str]]:
     """Fill in what the settings leave open of the camera; also say what was filled in.
 
     Only settings that are None are filled in; where `focal_px` was given, none of the intrinsics is.
     """
     settings: Any = resolved.settings
     if streams.kind is StreamKind.LANDMARKS:
-        return resolved, ["bearings need no camera: they are put into one that looks ahead"]
+        return _only_surveyed(resolved, recording), ["bearings need no camera: they are put into one that looks ahead"]
     if camera is None:
         if settings.focal_px is not None:
             return resolved, []
@@ -211,6 +213,15 @@ def with_camera(resolved: Resolved, camera: Camera | None, streams: Streams) -> 
     }
     filled = validated(settings, [Layer("the recording", fill)]).settings
     return Resolved(filled, resolved.given), notes
+
+
+def _only_surveyed(resolved: Resolved, recording: Recording) -> Resolved:
+    """Of measured landmarks those that are surveyed: of others it is not known that they stand still."""
+    settings: Any = resolved.settings
+    if "only_landmarks" not in type(settings).model_fields or "only_landmarks" in resolved.given:
+        return resolved
+    surveyed = {"only_landmarks": tuple(sorted(recording.landmarks))}
+    return Resolved(validated(settings, [Layer("the recording", surveyed)]).settings, resolved.given)
 
 
 _ANGLES = frozenset({"camera_yaw_rad", "camera_pitch_rad", "camera_roll_rad"})

@@ -28,7 +28,9 @@ ELLIPSE_POINTS = 17
 PLOTTED = 24
 """Slots that have plots of their own."""
 LISTED = 50
-"""Landmarks in the table of numbers, and with a label on the image."""
+"""Landmarks in the table of numbers."""
+LABELLED = 20
+"""Landmarks whose labels are shown all the time."""
 NEAR_M, FAR_M = 0.5, 50.0
 """Ends of the colours of range, which are logarithmic between."""
 LONGEST_RAY = 3.0

@@ -46,7 +46,7 @@ class RangeDrawing(Drawing):
             "predicted": rr.Points2D.from_fields(colors=0xFFFFFFFF, radii=rr.Radius.ui_points(2), draw_order=12),
             "innovation": rr.Arrows2D.from_fields(colors=0xFF5252FF, radii=thick, draw_order=13),
             "measured": rr.Points2D.from_fields(radii=rr.Radius.ui_points(3.5), draw_order=11),
-            "labels": rr.Points2D.from_fields(radii=rr.Radius.ui_points(0), show_labels=True, draw_order=14),
+            "labels": rr.Points2D.from_fields(radii=rr.Radius.ui_points(0), draw_order=14),
             "ranges": rr.Points2D.from_fields(radii=rr.Radius.ui_points(4.5), draw_order=15),
             "focus": rr.LineStrips2D.from_fields(colors=0x40C4FFFF, radii=thick, draw_order=9),
         }
@@ -69,10 +69,13 @@ class RangeDrawing(Drawing):
 
     def _surveyed(self, entity: str) -> None:
         numbers, places = zip(*sorted(self.scene.surveyed.items()), strict=True)
-        points = flat(np.array(places)[:, :2], "reference")
-        named = [str(number) for number in numbers] if len(numbers) <= ranges.LISTED else None
+        points = flat(np.array(places)[:, :2], "markers")
         look = rr.Points3D(
-            points, colors=COLOURS["reference"], radii=rr.Radius.ui_points(5.5), labels=named, show_labels=True
+            points,
+            colors=COLOURS["arrow"],
+            radii=rr.Radius.ui_points(2.5),
+            labels=[str(number) for number in numbers],
+            show_labels=len(numbers) <= ranges.LABELLED,
         )
         self.file.static(entity, look)
 
@@ -139,9 +142,7 @@ class RangeDrawing(Drawing):
         where = np.where(seen[..., None], measured, ranges.shown(table["mean"][..., :2], self.scene))
         carried = traces.finite(where, 2) & np.asarray(table["outcome"] != Outcome.LOST)
         if carried.shape[1] <= ranges.LISTED:
-            self._points2d(
-                "labels", table, where, carried, colors=colours[carried], labels=ranges.labels(table, carried)
-            )
+            self._labels(table, where, carried)
         told = carried & np.isfinite(table["range_m"])
         self._points2d("ranges", table, where, told, colors=ranges.range_colours(table["range_m"][told]))
         self._focus(table)
@@ -152,6 +153,14 @@ class RangeDrawing(Drawing):
     def _points2d(self, name: str, table: traces.Columns, points: Floats, chosen: Any, **more: Any) -> None:
         columns = rr.Points2D.columns(positions=points[chosen], **more)
         self.send(f"{self.image}/{name}", table, columns.partition(chosen.sum(axis=1)))
+
+    def _labels(self, table: traces.Columns, where: Floats, carried: Any) -> None:
+        """Numbers and ranges; those of many landmarks would hide the image and show only under the mouse."""
+        count = carried.sum(axis=1)
+        colours = ranges.status_colours(table["status"][carried])
+        columns = rr.Points2D.columns(positions=where[carried], colors=colours, labels=ranges.labels(table, carried))
+        shown = rr.Points2D.columns(show_labels=count <= ranges.LABELLED)
+        self.send(f"{self.image}/labels", table, columns.partition(count), shown)
 
     def _focus(self, table: traces.Columns) -> None:
         """A cross where the camera moves to."""

@@ -346,7 +346,7 @@ def _choose_for_ranges(request: Request, recording: Recording, resolved: Resolve
     offset_ns = _offset_ns(request)
     reference = range_inputs.load_reference(recording, request.reference, start_ns, stop_ns, offset_ns)
     camera = range_inputs.camera_of(recording, streams)
-    resolved, notes = range_inputs.with_camera(resolved, camera, streams)
+    resolved, notes = range_inputs.with_camera(resolved, recording, camera, streams)
     landmarks = range_inputs.landmarks_of(recording)
     account = RangeAccount.of(resolved.settings, camera, landmarks, reference, streams, offset_ns)
     return _Chosen(
