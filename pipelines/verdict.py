@@ -116,7 +116,7 @@ _SENTENCES: dict[Verdict, str] = {
     Verdict.NIS_HIGH: "the innovations are larger than the filter expects: noise settings, start, stamps or inputs",
     Verdict.NIS_LOW: "the innovations are smaller than the filter expects: its noise settings are too large",
     Verdict.INNOVATIONS_ONE_SIDED: "a landmark's innovations keep one sign: its start is wrong and trusted too much",
-    Verdict.INNOVATIONS_ALTERNATE: "a landmark's innovations alternate in sign: stamps or frames are swapped",
+    Verdict.INNOVATIONS_ALTERNATE: "the innovations alternate in sign: stamps or frames are swapped",
     Verdict.INNOVATIONS_FOLLOW_TURN: "the innovations in x follow the rate of turn: the images' stamps are off",
     Verdict.INPUT_STALE: "the last speed or rate of turn is old; it is held",
     Verdict.INPUT_MISSING: "there is no speed or no rate of turn yet: landmarks cannot be carried on",

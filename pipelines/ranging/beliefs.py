@@ -1,7 +1,7 @@
 """What is believed of n landmarks: each by itself, or all together with the speeds' shared noise.
 
 Both are values with the same methods, so that the estimator does not mind which one it carries. A landmark's mean is
-x, y, ξ (px, px, 1/m); A [n, 3, 3] and G [n, 3, m] are those of its prediction, q [m] the variances of the inputs.
+x, y, ξ (px, px, 1/m).
 """
 
 from __future__ import annotations
@@ -16,14 +16,13 @@ from numpy.typing import NDArray
 from pipelines.ranging import equations as eq
 from pipelines.ranging import filter as separate
 from pipelines.ranging import joint
-from pipelines.ranging.filter import UPPER, Inputs, Landmarks, Outcome, Update
+from pipelines.ranging.filter import UPPER, Inputs, Landmarks, Update
 from pipelines.ranging.joint import Joint
 from pipelines.ranging.settings import Model
 from pipelines.ranging.start import Start
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
-Flags = NDArray[np.bool_]
 
 NO_TIME = Inputs(0.0, 0.0, 0.0)
 
@@ -49,8 +48,13 @@ class Belief(Protocol):
         """These landmarks, followed by new ones."""
         ...
 
-    def carried(self, ahead: Floats, a: Floats, g: Floats, q: Floats) -> Self:
-        """The prediction (23), (24): P⁻ = A P Aᵀ + G (Q_c / dt) Gᵀ."""
+    @property
+    def pairs(self) -> Floats:
+        """P of each landmark with each other [n, n, 3, 3], or with itself alone [n, 1, 3, 3]."""
+        ...
+
+    def carried(self, ahead: Floats, pairs: Floats) -> Self:
+        """Another mean [n, 3] and covariance (see `pairs`) of the same landmarks."""
         ...
 
     def updated(self, model: Model, pixel: Floats, variance: Floats) -> tuple[Self, Update]:
@@ -83,10 +87,14 @@ class Separate:
             np.concatenate([self.rejections, np.zeros(len(starts), np.int64)]),
         )
 
-    def carried(self, ahead: Floats, a: Floats, g: Floats, q: Floats) -> Separate:
+    @property
+    def pairs(self) -> Floats:
         """See `Belief`."""
-        blocks = a @ self.blocks @ a.swapaxes(1, 2) + (g * q) @ g.swapaxes(1, 2)
-        return Separate(ahead, 0.5 * (blocks + blocks.swapaxes(1, 2)), self.rejections)
+        return self.blocks[:, None]
+
+    def carried(self, ahead: Floats, pairs: Floats) -> Separate:
+        """See `Belief`."""
+        return Separate(ahead, pairs[:, 0], self.rejections)
 
     def updated(
         self, model: Model, pixel: Floats, variance: Floats, inputs: Inputs = NO_TIME
@@ -130,13 +138,16 @@ class Together:
             grown = grown.and_also(start)
         return Together(grown)
 
-    def carried(self, ahead: Floats, a: Floats, g: Floats, q: Floats) -> Together:
+    @property
+    def pairs(self) -> Floats:
+        """See `Belief`."""
+        n = len(self.joint)
+        return self.joint.covariance.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
+
+    def carried(self, ahead: Floats, pairs: Floats) -> Together:
         """See `Belief`."""
         n = len(ahead)
-        pairs = self.joint.covariance.reshape(n, 3, n, 3).transpose(0, 2, 1, 3)
-        pairs = a[:, None] @ pairs @ a.swapaxes(1, 2)[None] + (g * q)[:, None] @ g.swapaxes(1, 2)[None]
-        covariance = pairs.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n)
-        return Together(Joint(ahead, 0.5 * (covariance + covariance.T), self.joint.rejections))
+        return Together(Joint(ahead, pairs.transpose(0, 2, 1, 3).reshape(3 * n, 3 * n), self.joint.rejections))
 
     def updated(self, model: Model, pixel: Floats, variance: Floats) -> tuple[Together, Update]:
         """See `Belief`; S, K, NIS and likelihood are those of each landmark by itself, before any update."""
@@ -176,8 +187,3 @@ class Together:
             focus_distance_px=none,
         )
         return Together(after), update
-
-
-def lost(update: Update) -> Flags:
-    """Which landmarks came behind the camera [n]."""
-    return np.asarray(update.outcome == Outcome.LOST)

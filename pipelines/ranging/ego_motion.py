@@ -17,6 +17,7 @@ import numpy as np
 from numba import njit
 from numpy.typing import NDArray
 
+from pipelines.ranging import joint
 from pipelines.ranging.settings import Model
 
 Floats = NDArray[np.float64]
@@ -133,3 +134,103 @@ def predicted(model: Model, mean: Floats, motion: Arc) -> tuple[Floats, Floats, 
     ahead, a, g = mean.copy(), np.empty((len(mean), 3, 3)), np.empty((len(mean), 3, 6))
     linearise_all(model, ahead, *motion, a, g)
     return ahead, a, g
+
+
+@_jit
+def _carry(model, aligned, mean, pairs, dt, omega, velocity, columns, q, turn, shift, a, g):  # type: ignore[no-untyped-def]
+    n, others, inputs = pairs.shape[0], pairs.shape[1], columns.shape[1]
+    half, all_six = np.empty((3, 3)), np.empty((n, 3, 6))
+    for k in range(len(dt)):
+        arc = _arc(omega[k], velocity[k], dt[k])
+        turn[:], shift[:] = arc[0] @ turn, arc[0] @ shift - arc[1]
+        if aligned:
+            joint.linearise_all(model, mean, omega[k, 1], velocity[k, 2], dt[k], a, g)
+        else:
+            linearise_all(model, mean, arc[0], arc[1], arc[2], arc[3], arc[4], a, all_six)
+            for i in range(n):
+                for r in range(3):
+                    for c in range(inputs):
+                        g[i, r, c] = 0.0
+                        for j in range(6):
+                            g[i, r, c] += all_six[i, r, j] * columns[j, c]
+        for i in range(n):
+            for at in range(1 if others == 1 else i + 1):
+                j = i if others == 1 else at
+                block = pairs[i, at]
+                for r in range(3):
+                    for c in range(3):
+                        half[r, c] = a[i, r, 0] * block[0, c] + a[i, r, 1] * block[1, c] + a[i, r, 2] * block[2, c]
+                for r in range(3):
+                    for c in range(3):
+                        value = half[r, 0] * a[j, c, 0] + half[r, 1] * a[j, c, 1] + half[r, 2] * a[j, c, 2]
+                        for m in range(inputs):
+                            value += g[i, r, m] * q[k, m] * g[j, c, m]
+                        block[r, c] = value
+                if j == i:
+                    for r in range(3):
+                        for c in range(r):
+                            block[r, c] = block[c, r]
+                else:
+                    pairs[j, i] = block.T
+
+
+class Carried(NamedTuple):
+    """Landmarks and the camera after some intervals.
+
+    Attributes:
+        mean: X⁻ [n, 3]; NaN for what came behind the camera.
+        pairs: P⁻ of each landmark with each other [n, n, 3, 3], or with itself alone [n, 1, 3, 3].
+        turn: where the camera looks: a fixed point P of the first frame's axes is at `turn` P + `shift_m` [3, 3].
+        shift_m: [3].
+        transition: A of the last interval [n, 3, 3]; NaN without one.
+        noise_gain: G of it [n, 3, c].
+    """
+
+    mean: Floats
+    pairs: Floats
+    turn: Floats
+    shift_m: Floats
+    transition: Floats
+    noise_gain: Floats
+
+
+def carried(
+    model: Model,
+    mean: Floats,
+    pairs: Floats,
+    turn: Floats,
+    shift_m: Floats,
+    *,
+    dt: Floats,
+    omega: Floats,
+    velocity: Floats,
+    columns: Floats,
+    q: Floats,
+    aligned: bool,
+) -> Carried:
+    """The prediction (23), (24) over m intervals: P⁻ = A P Aᵀ + G (Q_c / dt) Gᵀ in each.
+
+    Args:
+        model: settings and camera.
+        mean: X [n, 3].
+        pairs: P, see `Carried`.
+        turn: see `Carried`.
+        shift_m: see `Carried`.
+        dt: lengths of the intervals [m], s.
+        omega: angular velocity of the camera in its axes [m, 3].
+        velocity: velocity of the camera in its axes [m, 3].
+        columns: how the inputs err, (Δω, Δv) in camera axes [6, c].
+        q: their variances, the diagonal of Q_c / dt [m, c].
+        aligned: take ω_y and v_z only, in the forms of the equations that the model names; `columns` are these two.
+    """
+    n = len(mean)
+    out = Carried(
+        mean.copy(),
+        pairs.copy(),
+        turn.copy(),
+        shift_m.copy(),
+        np.full((n, 3, 3), np.nan),
+        np.full((n, 3, columns.shape[1]), np.nan),
+    )
+    _carry(model, aligned, out.mean, out.pairs, dt, omega, velocity, columns, q, *out[2:])
+    return out

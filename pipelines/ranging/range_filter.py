@@ -17,11 +17,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.estimator import EstimatorError
-from pipelines.ranging import ego_motion, joint, start
+from pipelines.ranging import ego_motion, start
 from pipelines.ranging import equations as eq
 from pipelines.ranging.beliefs import Separate, Together
 from pipelines.ranging.ego_motion import Arc
 from pipelines.ranging.filter import Inputs, Outcome, Update, statuses
+from pipelines.ranging.landmarks.settings import LandmarkKind
+from pipelines.ranging.landmarks.sources import source_of
 from pipelines.ranging.range_judging import History, Trends, alarms_of_frame
 from pipelines.ranging.range_settings import MotionModel, RangeSettings, StartKind
 from pipelines.ranging.robot_motion import (
@@ -73,6 +75,7 @@ class Roster:
         seen_ns: time of the last image point [n].
         first_px: image point at the start or the last reset [n, 2].
         first_turn: `Pose.turn` then [n, 3, 3].
+        most_px: largest derotated parallax since then [n]: a way back does not take from what it told.
     """
 
     ids: Longs
@@ -81,12 +84,13 @@ class Roster:
     seen_ns: Longs
     first_px: Floats
     first_turn: Floats
+    most_px: Floats
 
     @classmethod
     def none(cls) -> Roster:
         """No landmark."""
         whole = np.zeros(0, np.int64)
-        return cls(whole, whole, whole, whole, np.zeros((0, 2)), np.zeros((0, 3, 3)))
+        return cls(whole, whole, whole, whole, np.zeros((0, 2)), np.zeros((0, 3, 3)), np.zeros(0))
 
     def only(self, kept: Longs) -> Roster:
         """Some of the landmarks, by number."""
@@ -97,6 +101,7 @@ class Roster:
             self.seen_ns[kept],
             self.first_px[kept],
             self.first_turn[kept],
+            self.most_px[kept],
         )
 
     def and_also(self, other: Roster) -> Roster:
@@ -108,6 +113,7 @@ class Roster:
             np.concatenate([self.seen_ns, other.seen_ns]),
             np.concatenate([self.first_px, other.first_px]),
             np.concatenate([self.first_turn, other.first_turn]),
+            np.concatenate([self.most_px, other.most_px]),
         )
 
 
@@ -166,7 +172,7 @@ class RangeFilter:
         source: where the landmarks come from; None: what the settings name.
 
     Raises:
-        EstimatorError: the camera's focal length is unknown.
+        EstimatorError: the camera's focal length is unknown, or its lens model.
     """
 
     name: ClassVar[str] = "range"
@@ -176,12 +182,8 @@ class RangeFilter:
     def __init__(self, settings: RangeSettings, source: LandmarkSource[Any] | None = None) -> None:
         if settings.pinhole_focal_px is None:
             raise EstimatorError("the focal length is unknown: set focal_px, or landmarks = 'bearings'")
-        if source is None:
-            from pipelines.ranging.landmarks import source_of
-
-            source = source_of(settings)
         self._settings = settings
-        self._source = source
+        self._source = source or _source_of(settings)
         self._model = settings.kernel_model
         self._centre = settings.pinhole_centre_px
         self._noise = noise_of(settings)
@@ -217,11 +219,25 @@ class RangeFilter:
             return replace(state, velocities=velocities), None
         if state.frames and sample.stream == state.stream and sample.t_ns <= state.last_ns:
             return self._skip(state, sample)
-        source, sighting = self._source.sight(state.source, sample)
+        source, sighting = self._sighted(state, sample)
         if sighting is None and not (isinstance(sample, Problem) and sample.stream == state.stream):
             return replace(state, source=source), None
         damaged = Verdict.UNDECODABLE if isinstance(sample, Problem) else Verdict.OK
         return self._frame(replace(state, source=source), sample, sighting or NOTHING, damaged)
+
+    def _sighted(self, state: RangeState, sample: Sample) -> tuple[Any, Sighting | None]:
+        """What the source makes of a sample.
+
+        Raises:
+            EstimatorError: the samples are not such as the settings are for.
+        """
+        s = self._settings
+        if isinstance(sample, LandmarkSample) and s.landmarks is LandmarkKind.AUTO and s.focal_px is not None:
+            raise EstimatorError("focal_px is for images and tracks: set landmarks = 'bearings', or leave focal_px out")
+        try:
+            return self._source.sight(state.source, sample)
+        except ValueError as error:
+            raise EstimatorError(str(error)) from error
 
     # ------------------------------------------------------------------------------ one frame
 
@@ -258,10 +274,11 @@ class RangeFilter:
         history = state.history
         if ride is not None:
             history = history.taking(s, update, omega, dt_s)
-        status = statuses(update, max_relative_sigma=s.max_relative_sigma, min_parallax_px=s.min_parallax_px)
+        told = update._replace(derotated_parallax_px=everyone.most_px)
+        status = statuses(told, max_relative_sigma=s.max_relative_sigma, min_parallax_px=s.min_parallax_px)
         age = state.frames - everyone.born
         degrees = 1 if isinstance(sample, LandmarkSample) else 2
-        alarms |= alarms_of_frame(s, update, status, measured, age, trends, history, degrees)
+        alarms |= alarms_of_frame(s, told, status, measured, age, trends, history, degrees)
         if ride is not None and ride.still.any():
             alarms |= Verdict.STANDSTILL
         step = self._record(state, sample, everyone, update, status, measured, driven, ride, alarms, pixel, started)
@@ -283,9 +300,7 @@ class RangeFilter:
         )
         return after, step
 
-    def _alarms_of_inputs(
-        self, state: RangeState, sample: Sample, moving: bool, first: bool, dt_s: float
-    ) -> Verdict:
+    def _alarms_of_inputs(self, state: RangeState, sample: Sample, moving: bool, first: bool, dt_s: float) -> Verdict:
         s, known = self._settings, state.velocities
         alarms = Verdict.FIRST_FRAME if first else Verdict.OK
         if not moving:
@@ -306,39 +321,32 @@ class RangeFilter:
     def _driven(self, state: RangeState, ride: Ride | None) -> Driven:
         """Carry landmarks, pose and candidates over every interval since the last frame (23), (24)."""
         n = len(state.roster.ids)
-        belief, pose, candidates = state.belief, state.pose, state.candidates
-        a, g = np.full((n, 3, 3), np.nan), np.full((n, 3, 2), np.nan)
         if ride is None:
-            return Driven(belief, pose, candidates, a, g, None)
-        last, again = len(ride.dt) - 1, self._model.relinearisations > 0
-        for k in range(len(ride.dt)):
-            arc = ego_motion.arc(ride.omega[k], ride.velocity[k], ride.dt[k])
-            pose = pose.after(arc)
-            candidates = tuple(c._replace(motion=self._candidate_motion(c.motion, ride, k)) for c in candidates)
-            if again and k == last:
-                break
-            ahead, a, g = self._predicted(belief.mean, ride, k, arc)
-            belief = belief.carried(ahead, a, g, self._input_variance(ride, k))
-        inputs = Inputs(ride.omega[-1, 1], ride.velocity[-1, 2], ride.dt[-1], bool(ride.still[-1])) if again else None
-        return Driven(belief, pose, candidates, a, g[..., :2], inputs)
-
-    def _predicted(self, mean: Floats, ride: Ride, k: int, arc: Arc) -> tuple[Floats, Floats, Floats]:
-        """X⁻, A and G over one interval, G by the columns of the inputs' noise."""
-        if self._settings.motion is not MotionModel.ALIGNED:
-            ahead, a, g = ego_motion.predicted(self._model, mean, arc)
-            return ahead, a, g @ self._noise.columns
-        ahead, a, g = mean.copy(), np.empty((len(mean), 3, 3)), np.empty((len(mean), 3, 2))
-        joint.linearise_all(self._model, ahead, ride.omega[k, 1], ride.velocity[k, 2], ride.dt[k], a, g)
-        return ahead, a, g
-
-    def _input_variance(self, ride: Ride, k: int) -> Floats:
-        """The diagonal of Q_c / dt (24); 0 for the speeds of a robot that stands."""
-        variance = self._noise.density / ride.dt[k]
-        return np.where(self._noise.speeds & ride.still[k], 0.0, variance)
-
-    def _candidate_motion(self, motion: CameraMotion, ride: Ride, k: int) -> CameraMotion:
-        q_omega, q_speed = self._input_variance(ride, k)[:2]
-        return motion.then(eq.held(ride.omega[k, 1], ride.velocity[k, 2], ride.dt[k]), q_omega, q_speed)
+            none = np.full((n, 3, 3), np.nan)
+            return Driven(state.belief, state.pose, state.candidates, none, none[..., :2], None)
+        variance = self._noise.density / ride.dt[:, None]
+        variance[np.ix_(ride.still, self._noise.speeds)] = 0.0  # a robot that stands has no error of speed
+        again = self._model.relinearisations > 0
+        stop = len(ride.dt) - again
+        out = ego_motion.carried(
+            self._model,
+            state.belief.mean,
+            state.belief.pairs,
+            *state.pose,
+            dt=ride.dt[:stop],
+            omega=ride.omega[:stop],
+            velocity=ride.velocity[:stop],
+            columns=self._noise.columns,
+            q=variance[:stop],
+            aligned=self._settings.motion is MotionModel.ALIGNED,
+        )
+        pose, inputs = Pose(out.turn, out.shift_m), None
+        if again:
+            pose = pose.after(ego_motion.arc(ride.omega[-1], ride.velocity[-1], ride.dt[-1]))
+            inputs = Inputs(ride.omega[-1, 1], ride.velocity[-1, 2], ride.dt[-1], bool(ride.still[-1]))
+        candidates = tuple(c._replace(motion=_continued(c.motion, ride, variance)) for c in state.candidates)
+        belief = state.belief.carried(out.mean, out.pairs)
+        return Driven(belief, pose, candidates, out.transition, out.noise_gain[..., :2], inputs)
 
     def _updated(self, driven: Driven, pixel: Floats, variance: Floats) -> tuple[Separate | Together, Update]:
         """Gate and update (25)-(27); A and G are those of the last interval."""
@@ -371,6 +379,7 @@ class RangeFilter:
             seen_ns=seen_ns,
             first_px=np.where(again[:, None], pixel, roster.first_px),
             first_turn=np.where(again[:, None, None], driven.pose.turn, roster.first_turn),
+            most_px=np.where(again, 0.0, np.fmax(roster.most_px, np.where(seen, update.derotated_parallax_px, 0.0))),
         )
         return roster, state.trends.taking(update), update
 
@@ -393,7 +402,8 @@ class RangeFilter:
     def _starts(self, state: RangeState, driven: Driven, seen: Sighting, t_ns: int) -> tuple[Sighting, list[Start]]:
         """Those of the sighted landmarks that start in this frame, as many as there are slots, and their starts."""
         free = self._settings.max_landmarks - len(state.roster.ids)
-        rows, starts = [], []
+        rows: list[int] = []
+        starts: list[Start] = []
         known = set(state.roster.ids.tolist())
         for row, number in enumerate(seen.ids.tolist()):
             if len(starts) == free or number in known:
@@ -403,7 +413,7 @@ class RangeFilter:
                 known.add(number)
                 rows.append(row)
                 starts.append(begun)
-        return Sighting(*(part[rows] for part in seen)), starts
+        return Sighting(seen.ids[rows], seen.points_px[rows], seen.sigma_px[rows]), starts
 
     def _start_of(self, driven: Driven, seen: Sighting, row: int) -> Start | None:
         """The start of one landmark, None while it waits."""
@@ -438,9 +448,7 @@ class RangeFilter:
                 still = self._seen_from(waiting.first_px[None], turn[None])[0]
                 if not np.linalg.norm(seen.points_px[row] - still) >= self._settings.start_parallax_px:
                     return None
-                return start.from_two_views(
-                    self._model, seen.points_px[row], waiting.first_px, noise, waiting.motion
-                )
+                return start.from_two_views(self._model, seen.points_px[row], waiting.first_px, noise, waiting.motion)
         return None
 
     def _from_second_landmark(self, seen: Sighting, row: int, noise: float) -> Start | None:
@@ -477,9 +485,7 @@ class RangeFilter:
         for number, row in row_of.items():
             if number not in taken and len(kept) < s.max_landmarks:
                 noise = float(seen.sigma_px[row] ** 2)
-                kept.append(
-                    Candidate(number, seen.points_px[row], noise, CameraMotion.none(), driven.pose.turn, t_ns)
-                )
+                kept.append(Candidate(number, seen.points_px[row], noise, CameraMotion.none(), driven.pose.turn, t_ns))
         return tuple(kept)
 
     def _enrolled(self, state: RangeState, roster: Roster, started: Sighting, t_ns: int, pose: Pose) -> Roster:
@@ -493,6 +499,7 @@ class RangeFilter:
             np.full(n, t_ns, np.int64),
             started.points_px.astype(np.float64).reshape(n, 2),
             np.broadcast_to(pose.turn, (n, 3, 3)).copy(),
+            np.zeros(n),
         )
 
     # ------------------------------------------------------------------------------- records
@@ -512,7 +519,9 @@ class RangeFilter:
         started: Sighting,
     ) -> RangeStep:
         s, known = self._settings, state.velocities
-        velocities = np.full((1, 2), np.nan) if ride is None else np.column_stack([ride.omega[:, 1], ride.velocity[:, 2]])
+        velocities = (
+            np.full((1, 2), np.nan) if ride is None else np.column_stack([ride.omega[:, 1], ride.velocity[:, 2]])
+        )
         dt = np.ones(1) if ride is None else ride.dt
         bias = bias_of(s, known) if ride is None else ride.bias_radps
 
@@ -616,6 +625,21 @@ class RangeFilter:
             focus_distance_px=none(),
         )
         return replace(state, frames=state.frames + 1), step
+
+
+def _source_of(settings: RangeSettings) -> LandmarkSource[Any]:
+    try:
+        return source_of(settings, settings.camera, surveyed=settings.only_landmarks or None)
+    except ValueError as error:
+        raise EstimatorError(str(error)) from error
+
+
+def _continued(motion: CameraMotion, ride: Ride, variance: Floats) -> CameraMotion:
+    """A motion, followed by the intervals of a frame."""
+    for k in range(len(ride.dt)):
+        held = eq.held(ride.omega[k, 1], ride.velocity[k, 2], ride.dt[k])
+        motion = motion.then(held, variance[k, 0], variance[k, 1])
+    return motion
 
 
 def _mean(dt: Floats, values: Floats) -> float:

@@ -73,12 +73,14 @@ class Trends:
         """With the innovations of a step; a reset begins again."""
         spread = np.sqrt(np.diagonal(update.innovation_covariance, axis1=1, axis2=2))
         white = np.clip(update.innovation / spread, -4.0, 4.0)
-        seen = np.isfinite(white).all(axis=1)[:, None]
+        seen = np.asarray(np.isfinite(white).all(axis=1))[:, None]
         white = np.where(seen, white, 0.0)
-        again = (update.outcome == Outcome.RESET)[:, None]
+        again = np.asarray(update.outcome == Outcome.RESET)[:, None]
         return Trends(
             np.where(again, 0.0, np.where(seen, FORGET * self.mean + (1 - FORGET) * white, self.mean)),
-            np.where(again, 0.0, np.where(seen, FORGET * self.product + (1 - FORGET) * white * self.last, self.product)),
+            np.where(
+                again, 0.0, np.where(seen, FORGET * self.product + (1 - FORGET) * white * self.last, self.product)
+            ),
             np.where(again, 0.0, np.where(seen, white, self.last)),
             np.where(again[:, 0], 0, self.updates + seen[:, 0]),
         )
@@ -99,7 +101,7 @@ class History:
 
     nis: tuple[float, ...] = ()
     dt_s: tuple[float, ...] = ()
-    turning: Turning = Turning()  # noqa: RUF009 (a tuple)
+    turning: Turning = Turning()
 
     def taking(self, s: RangeSettings, update: Update, omega: float, dt_s: float) -> History:
         """With one frame: its update, its mean rate of turn (rad/s), the time since the frame before."""
@@ -118,9 +120,7 @@ class History:
                 keep * turning.omega + (1 - keep) * omega * omega,
                 turning.frames + 1,
             )
-        return replace(
-            self, nis=(*self.nis, *level)[-kept:], dt_s=(*self.dt_s, dt_s)[-kept:], turning=turning
-        )
+        return replace(self, nis=(*self.nis, *level)[-kept:], dt_s=(*self.dt_s, dt_s)[-kept:], turning=turning)
 
 
 def alarms_of_frame(
@@ -137,7 +137,8 @@ def alarms_of_frame(
 
     Args:
         s: the settings.
-        update: of all n landmarks, those that started in this frame among them.
+        update: of all n landmarks, those that started in this frame among them; the derotated parallax is the
+            largest so far.
         status: `Status` [n].
         measured: has an image point [n].
         age_frames: frames since the start [n].
@@ -202,11 +203,11 @@ def _alarms_of_trends(s: RangeSettings, trends: Trends, history: History) -> Ver
     limit = s.trend_sigmas * TREND_SIGMA
     if (np.abs(trends.mean[old]) > limit).any():
         alarms |= Verdict.INNOVATIONS_ONE_SIDED
-    if (trends.product[old] < -limit).any():
+    if old.any() and (np.median(trends.product[old], axis=0) < -limit).any():
         alarms |= Verdict.INNOVATIONS_ALTERNATE
     turning = history.turning
     power = turning.innovation * turning.omega
-    if turning.frames >= 2 * TREND_UPDATES and turning.omega > TURNING_RADPS**2 and turning.innovation > 1.0:
-        if abs(turning.both) > FOLLOWS * power**0.5:
-            alarms |= Verdict.INNOVATIONS_FOLLOW_TURN
+    telling = turning.frames >= 2 * TREND_UPDATES and turning.omega > TURNING_RADPS**2 and turning.innovation > 1.0
+    if telling and abs(turning.both) > FOLLOWS * power**0.5:
+        alarms |= Verdict.INNOVATIONS_FOLLOW_TURN
     return alarms

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from enum import StrEnum
 from typing import Annotated, Literal, Self
 
@@ -10,7 +11,9 @@ from numpy.typing import NDArray
 from pydantic import Field, model_validator
 from scipy.spatial.transform import Rotation
 
+from pipelines.lens import pinhole
 from pipelines.ranging.inputs import Synchronisation
+from pipelines.ranging.landmarks.settings import LandmarkKind, LandmarkSettings
 from pipelines.ranging.settings import (
     FilterSettings,
     Flow,
@@ -21,6 +24,7 @@ from pipelines.ranging.settings import (
     TransitionForm,
 )
 from pipelines.simulation.motion import FORWARD, looking
+from readers.streams import Camera
 
 Floats = NDArray[np.float64]
 Triple = tuple[float, float, float]
@@ -41,18 +45,6 @@ class MotionModel(StrEnum):
     """All six velocities, as of a camera that is carried by hand."""
 
 
-class Landmarks(StrEnum):
-    """Where the landmarks come from."""
-
-    AUTO = "auto"
-    """By the samples: recorded tracks, bearings, or corners in images."""
-    TRACKS = "tracks"
-    BEARINGS = "bearings"
-    CORNERS = "corners"
-    CHESSBOARD = "chessboard"
-    ARUCO = "aruco"
-
-
 class StartKind(StrEnum):
     """What is known of a new landmark's range."""
 
@@ -68,7 +60,7 @@ class StartKind(StrEnum):
     """Its offset from another landmark; those that have none start as `broad`."""
 
 
-class RangeSettings(FilterSettings):
+class RangeSettings(FilterSettings, LandmarkSettings):
     """Every default of the range estimator by name; unknown keys are an error.
 
     The defaults are those of the preset ``best``. Robot axes: x forward, y left, z up; camera axes: x right, y down,
@@ -93,19 +85,12 @@ class RangeSettings(FilterSettings):
     camera_position_m: Triple | None = Field(None, description="camera in the robot; None: at the turning point")
     imu_yaw_pitch_roll_rad: Triple = Field((0.0, 0.0, 0.0), description="axes of the IMU in the robot")
 
-    # landmarks
-    landmarks: Landmarks = Field(Landmarks.AUTO, description="where the landmarks come from")
+    # landmarks; where they come from is in `landmarks` and the sections of the sources
     max_landmarks: Annotated[int, Field(ge=1, le=4096)] = Field(32, description="slots N: landmarks at a time")
     keep_unseen_s: NotNegative = Field(1.0, description="a landmark without an image point is predicted so long")
-    max_corners: Annotated[int, Field(ge=1)] = Field(32, description="corners: tracked at a time")
-    board_columns: Annotated[int, Field(ge=2)] = Field(8, description="boards: inner corners in a row")
-    board_rows: Annotated[int, Field(ge=2)] = Field(6, description="boards: rows of inner corners")
-    square_m: Positive | None = Field(None, description="boards: side of a square; None: unknown")
-    marker_m: Positive | None = Field(None, description="aruco: side of a marker; None: unknown")
-    aruco_dictionary: str = Field("4x4_50", description="aruco: dictionary of the markers, such as apriltag_36h11")
-    board_points: Literal["first", "all"] = Field("all", description="boards: the upper-left corner (paper) or all")
-    bearing_sigma_rad: Positive = Field(0.01, description="bearings: noise of a bearing")
-    bearing_focal_px: Positive = Field(500.0, description="bearings: focal length of the camera they are put into")
+    only_landmarks: tuple[int, ...] = Field(
+        (), description="bearings: numbers that count, such as the surveyed ones; none: all"
+    )
 
     # inputs
     motion: MotionModel = Field(MotionModel.PLANAR, description="which of the robot's motion is used")
@@ -142,7 +127,9 @@ class RangeSettings(FilterSettings):
     start_plane_sigma_m: Positive = Field(0.5, description="plane: σ of its distance")
     start_parallax_px: Positive = Field(5.0, description="two-views: derotated parallax that is waited for")
     start_pair: tuple[int, int] = Field((0, 1), description="second-landmark: numbers of the two landmarks")
-    start_offset_m: Triple = Field((0.0, 0.0, 0.0), description="second-landmark: from the first to the second, robot axes")
+    start_offset_m: Triple = Field(
+        (0.0, 0.0, 0.0), description="second-landmark: from the first to the second, robot axes"
+    )
     start_offset_sigma_m: Positive = Field(0.01, description="second-landmark: σ of each coordinate of that")
 
     # many landmarks
@@ -174,10 +161,15 @@ class RangeSettings(FilterSettings):
             raise ValueError(f"mode = 'joint' is for max_landmarks up to {JOINT_LIMIT}, not {self.max_landmarks}")
         if self.mode == "joint" and self.relinearisations:
             raise ValueError("relinearisations are for mode = 'independent'")
-        if self.motion is MotionModel.SPATIAL and self.start is StartKind.TWO_VIEWS:
-            raise ValueError("start = 'two-views' is for motion = 'aligned' or 'planar'; use start = 'broad'")
+        if self.motion is not MotionModel.ALIGNED and self.start is StartKind.TWO_VIEWS:
+            raise ValueError("start = 'two-views' is for motion = 'aligned'; use start = 'broad'")
         if self.start is StartKind.PLANE and not np.linalg.norm(self.start_plane_normal) > 0.0:
             raise ValueError("start_plane_normal must not be zero")
+        if self.pixel_sigma != FilterSettings().pixel_sigma:
+            raise ValueError(
+                "the noise of an image point is that of its source: set tracks.sigma_px, corners.sigma_px, "
+                "board.sigma_px, markers.sigma_px or bearings.sigma_rad instead of pixel_sigma"
+            )
         if self.camera_quat_xyzw is not None and not np.linalg.norm(self.camera_quat_xyzw) > 0.0:
             raise ValueError("camera_quat_xyzw must not be zero")
         return self
@@ -188,7 +180,9 @@ class RangeSettings(FilterSettings):
         if self.camera_quat_xyzw is not None:
             return np.asarray(Rotation.from_quat(self.camera_quat_xyzw).as_matrix())
         return np.asarray(
-            looking(FORWARD, yaw_rad=self.camera_yaw_rad, pitch_rad=self.camera_pitch_rad, roll_rad=self.camera_roll_rad)
+            looking(
+                FORWARD, yaw_rad=self.camera_yaw_rad, pitch_rad=self.camera_pitch_rad, roll_rad=self.camera_roll_rad
+            )
         )
 
     @property
@@ -197,18 +191,31 @@ class RangeSettings(FilterSettings):
         return np.asarray(Rotation.from_euler("ZYX", self.imu_yaw_pitch_roll_rad).as_matrix())
 
     @property
+    def camera(self) -> Camera | None:
+        """The camera as its images are; None where the focal length is unknown."""
+        if self.focal_px is None:
+            return None
+        width, height = self.image_size_px or (1, 1)
+        model, centre = self.distortion_model or "none", self.centre_px or (0.0, 0.0)
+        made = pinhole(width, height, self.focal_px, model=model, distortion=self.distortion or (), centre_px=centre)
+        matrix = made.matrix.copy()
+        matrix[1, 1] = self.focal_y_px or self.focal_px
+        size = (0, 0) if self.image_size_px is None else self.image_size_px
+        return replace(made, width_px=size[0], height_px=size[1], matrix=matrix)
+
+    @property
     def pinhole_focal_px(self) -> float | None:
         """Focal length of the pinhole that image points are for; that of bearings where there is no camera."""
-        if self.landmarks is Landmarks.BEARINGS:
-            return self.bearing_focal_px
-        if self.focal_px is None and self.landmarks is Landmarks.AUTO:
-            return self.bearing_focal_px
+        if self.landmarks is LandmarkKind.BEARINGS:
+            return self.bearings.focal_px
+        if self.focal_px is None and self.landmarks is LandmarkKind.AUTO:
+            return self.bearings.focal_px
         return self.focal_px
 
     @property
     def pinhole_centre_px(self) -> tuple[float, float]:
         """Principal point of that pinhole; (0, 0) for bearings."""
-        bearings = self.landmarks is Landmarks.BEARINGS or self.focal_px is None
+        bearings = self.landmarks is LandmarkKind.BEARINGS or self.focal_px is None
         return (0.0, 0.0) if bearings or self.centre_px is None else self.centre_px
 
     @property

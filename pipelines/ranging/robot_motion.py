@@ -20,6 +20,8 @@ from readers.streams import ImuSample, OdometrySample
 
 Floats = NDArray[np.float64]
 
+Value = tuple[float, ...]
+
 NS = 1e-9
 
 
@@ -27,9 +29,9 @@ class Signal(NamedTuple):
     """Values by time, the times rising."""
 
     t_ns: tuple[int, ...] = ()
-    values: tuple[Floats, ...] = ()
+    values: tuple[Value, ...] = ()
 
-    def having(self, t_ns: int, value: Floats) -> Signal:
+    def having(self, t_ns: int, value: Value) -> Signal:
         """With one more value; of two with the same time the first counts."""
         if not self.t_ns or t_ns > self.t_ns[-1]:
             return Signal((*self.t_ns, t_ns), (*self.values, value))
@@ -72,10 +74,10 @@ class Velocities:
     """
 
     rest: Rest
-    speed: Signal = Signal()  # noqa: RUF009 (a tuple)
-    wheels: Signal = Signal()  # noqa: RUF009
-    gyro: Signal = Signal()  # noqa: RUF009
-    window: Signal = Signal()  # noqa: RUF009
+    speed: Signal = Signal()
+    wheels: Signal = Signal()
+    gyro: Signal = Signal()
+    window: Signal = Signal()
     disorder: bool = False
     unusable: bool = False
 
@@ -132,9 +134,9 @@ def noise_of(s: RangeSettings) -> Noise:
         )
     across = [s.sigma_omega if s.sigma_omega_across is None else s.sigma_omega_across] * 2
     aside = [s.sigma_speed if s.sigma_speed_across is None else s.sigma_speed_across] * 2
-    columns = [*turns, *speeds, _turning(s, x), _turning(s, y), _driving(s, y), _driving(s, z)]
+    others = [_turning(s, x), _turning(s, y), _driving(s, y), _driving(s, z)]
     return Noise(
-        np.stack(columns, axis=1),
+        np.stack(turns + speeds + others, axis=1),
         np.array([s.sigma_omega, s.sigma_speed, *across, *aside]) ** 2,
         np.array([False, True, False, False, True, True]),
     )
@@ -157,9 +159,9 @@ def _driving(s: RangeSettings, axis: Floats) -> Floats:
 
 def with_odometry(s: RangeSettings, known: Velocities, sample: OdometrySample, last_frame_ns: int) -> Velocities:
     """Take one message of the odometry; one without velocities is noted as unusable."""
-    velocity = sample.linear_velocity_mps
-    used = velocity if s.motion is not MotionModel.PLANAR else np.array([velocity[0], 0.0, 0.0])
-    if not np.isfinite(used).all():
+    velocity = tuple(sample.linear_velocity_mps.tolist())
+    used = velocity if s.motion is not MotionModel.PLANAR else (velocity[0], 0.0, 0.0)
+    if not all(map(math.isfinite, used)):
         return replace(known, unusable=True)
     late = bool(known.speed.t_ns) and sample.t_ns < known.speed.t_ns[-1]
     if late and sample.t_ns <= last_frame_ns:
@@ -167,9 +169,11 @@ def with_odometry(s: RangeSettings, known: Velocities, sample: OdometrySample, l
     window = known.window if late else _windowed(s, known.window.having(sample.t_ns, used))
     still = float(s.zero_velocity_update and stands(s, window))
     wheels = known.wheels
-    if np.isfinite(sample.angular_velocity_radps[2]):
-        wheels = _kept(wheels.having(sample.t_ns, np.nan_to_num(sample.angular_velocity_radps)), last_frame_ns)
-    speed = _kept(known.speed.having(sample.t_ns, np.append(used, still)), last_frame_ns)
+    turn = tuple(sample.angular_velocity_radps.tolist())
+    if math.isfinite(turn[2]):
+        turn = tuple(value if math.isfinite(value) else 0.0 for value in turn)
+        wheels = _kept(wheels.having(sample.t_ns, turn), last_frame_ns)
+    speed = _kept(known.speed.having(sample.t_ns, (*used, still)), last_frame_ns)
     moved = not still and _lasts(s, window)
     rest = known.rest._replace(over=True) if moved else known.rest
     return replace(
@@ -190,7 +194,7 @@ def with_imu(s: RangeSettings, known: Velocities, sample: ImuSample, last_frame_
     late = bool(known.gyro.t_ns) and sample.t_ns < known.gyro.t_ns[-1]
     if late and sample.t_ns <= last_frame_ns:
         return replace(known, disorder=True)
-    gyro = _kept(known.gyro.having(sample.t_ns, omega), last_frame_ns)
+    gyro = _kept(known.gyro.having(sample.t_ns, tuple(omega.tolist())), last_frame_ns)
     return replace(known, gyro=gyro, disorder=known.disorder or late)
 
 
@@ -217,10 +221,15 @@ def stands(s: RangeSettings, window: Signal) -> bool:
     """
     if not _lasts(s, window):
         return False
-    dt = np.diff(window.t_ns)[::-1] * NS
-    way = np.cumsum(np.array(window.values)[:0:-1] * dt[:, None], axis=0)
-    limit = s.standstill_sigmas * s.sigma_speed * np.sqrt(np.cumsum(dt))
-    return bool((np.linalg.norm(way, axis=1) <= limit).all())
+    limit = (s.standstill_sigmas * s.sigma_speed) ** 2 * NS
+    t_ns, x, y, z = window.t_ns, 0.0, 0.0, 0.0
+    for k in range(len(t_ns) - 1, 0, -1):
+        dt = (t_ns[k] - t_ns[k - 1]) * NS
+        vx, vy, vz = window.values[k]
+        x, y, z = x + vx * dt, y + vy * dt, z + vz * dt
+        if x * x + y * y + z * z > limit * (t_ns[-1] - t_ns[k - 1]):
+            return False
+    return True
 
 
 # ----------------------------------------------------------------------------- a frame
@@ -259,7 +268,10 @@ def ridden(s: RangeSettings, known: Velocities, last_ns: int, t_ns: int) -> tupl
     turn = turn_signal(s, known)
     # what comes after the frame (messages of the same time, or a disordered log) is for the next one
     found = intervals(
-        *_arrays(turn, last_ns), *_arrays(known.speed, last_ns), np.array([0.0, (t_ns - last_ns) * NS]), s.synchronisation
+        *_arrays(turn, last_ns),
+        *_arrays(known.speed, last_ns),
+        np.array([0.0, (t_ns - last_ns) * NS]),
+        s.synchronisation,
     )
     raw, velocity, still = found.omega.T, found.speed[:3].T, found.speed[3] == 1.0
     rest = _rested(s, known.rest, raw, still, found.dt) if turn is known.gyro else known.rest
@@ -273,8 +285,9 @@ def ridden(s: RangeSettings, known: Velocities, last_ns: int, t_ns: int) -> tupl
         unusable=False,
     )
     bias = bias_of(s, kept)
-    turned = s.synchronisation is not Synchronisation.AS_PRINTED or raw.any(axis=1)[:, None]
-    omega = np.where(turned, raw - bias, 0.0)
+    # as printed, there is no rate of turn at all in an interval without a message of the gyro
+    turned = np.asarray(raw.any(axis=1) | (s.synchronisation is not Synchronisation.AS_PRINTED))
+    omega = np.where(turned[:, None], raw - bias, 0.0)
     velocity = np.where(still[:, None], 0.0, velocity)
     return kept, Ride(found.dt, *_at_camera(s, omega, velocity), still, bias)
 
