@@ -117,7 +117,7 @@ def log(file: Path, updates: list[tuple[Update, np.ndarray]], count: int, dt_s: 
         scene=RangeScene(FOCAL, CENTRE, SIZE, referenced=True),
     ) as run:
         for one in steps(updates, count, dt_s):
-            run.step(one, Beside(np.array([0.0, 0.0, 0.0]), one.range_m))
+            run.step(one, Beside(np.eye(4), one.range_m))
         run.finish({}, None)
 
 

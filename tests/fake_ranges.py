@@ -11,7 +11,7 @@ from pipelines.ranging.settings import FilterSettings
 from pipelines.ranging.start import from_broad_prior
 from pipelines.ranging.step import RangeStep
 from pipelines.verdict import Verdict
-from workbench.range_traces import Beside, RangeScene
+from workbench.range_traces import Beside, RangeScene, level
 
 Floats = NDArray[np.float64]
 
@@ -49,7 +49,7 @@ def pixels(frame: int, count: int) -> Floats:
 def beside(frame: int, slots: int, count: int) -> Beside:
     depth = np.full(slots, np.nan)
     depth[:count] = places(count)[:, 0] - camera_at(frame)[0]
-    return Beside(camera_at(frame), depth)
+    return Beside(level(camera_at(frame)[None])[0], depth)
 
 
 def steps(number: int, *, slots: int = 6, count: int = 4, seed: int = 1, late: int = 5) -> Iterator[RangeStep]:

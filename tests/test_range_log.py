@@ -127,7 +127,7 @@ def test_the_gate_is_where_the_nis_is_13_8() -> None:
 def test_ellipses_from_above_are_the_spread_of_samples() -> None:
     step = list(fake_ranges.steps(60, slots=SLOTS, count=COUNT))[-1]
     table = table_of([step])
-    camera = np.array([[1.0, 2.0, 0.7]])
+    camera = ranges.level(np.array([[1.0, 2.0, 0.7]]))
     scene = fake_ranges.scene(COUNT)
     above = ranges.from_above(table, camera, scene)
     rng = np.random.default_rng(1)
@@ -208,6 +208,6 @@ def test_a_step_without_landmarks_and_without_reference_is_logged(tmp_path: Path
         tmp_path / "run.rrd", recording_id="m", run="a", estimator="range", step_type=RangeStep, settings_text=""
     ) as writer:
         writer.step(bare)
-        writer.step(dataclasses.replace(bare, frame=1), Beside(np.full(3, np.nan), np.full(SLOTS, np.nan)))
+        writer.step(dataclasses.replace(bare, frame=1), Beside(np.full((4, 4), np.nan), np.full(SLOTS, np.nan)))
         writer.finish({}, None)
     assert len(rrd.read_steps(tmp_path / "run.rrd", "a", RangeStep)) == 2

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import colorsys
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -181,33 +182,40 @@ _ONE = (  # of one landmark: entity, name
 def _landmark_plots(root: str, bounds: Bounds) -> rrb.Tabs:
     """A tab for all landmarks, and one for each."""
 
-    def plot(name: str, contents: Sequence[str], *, top: float = 0.0, show: Sequence[bool] = ()) -> rrb.TimeSeriesView:
-        lines = rr.SeriesLines.from_fields(visible_series=list(show))
-        overrides: dict[Any, Any] = dict.fromkeys(contents, lines) if show else {}
+    def plot(
+        name: str, contents: Sequence[str], *, top: float = 0.0, overrides: Mapping[Any, Any] | None = None
+    ) -> rrb.TimeSeriesView:
         return rrb.TimeSeriesView(
             origin=root,
             contents=list(contents),
             name=name,
             axis_x=_axis(bounds.frames),
             axis_y=rrb.ScalarAxis(range=(0.0, top), zoom_lock=False) if top > 0 else None,
-            overrides=overrides,
+            overrides=dict(overrides or {}),
             plot_legend=rrb.PlotLegend(visible=False),
         )
 
-    def every(entity: str) -> list[str]:
-        return [f"{root}/landmark/{slot}/{entity}" for slot, _, _ in bounds.landmarks]
+    def every(title: str, entity: str, *more: str, top: float = 0.0, show: Sequence[bool] = (True,)) -> Any:
+        """One series of each landmark, in the landmark's colour."""
+        entities = {f"{root}/landmark/{slot}/{entity}": _slot_colour(slot) for slot, _, _ in bounds.landmarks}
+        looks = {
+            path: rr.SeriesLines.from_fields(visible_series=list(show), colors=np.full(len(show), colour, np.uint32))
+            for path, colour in entities.items()
+        }
+        return plot(title, [*entities, *more], top=top, overrides=looks)
 
     chi2 = f"{root}/bounds/nis"
+    highest = max((top for _, _, top in bounds.landmarks), default=0.0)
     all_of_them = rrb.Grid(
-        plot("Ranges Z, m", every("range"), top=max((t for _, _, t in bounds.landmarks), default=0.0),
-             show=[True, False, False, False]),
-        plot("NIS; 5.99 and 13.8 of χ²", [*every("nis"), chi2], top=4 * 5.99),
-        plot("σ_ξ/ξ", every("relative_sigma"), top=0.5),
-        plot("Derotated parallax, px", every("parallax"), show=[False, True, False]),
+        every("Ranges Z, m", "range", top=highest, show=[True, False, False, False]),
+        every("NIS; 5.99 and 13.8 of χ²", "nis", chi2, top=4 * 5.99),
+        every("σ_ξ/ξ", "relative_sigma", top=0.5),
+        every("Derotated parallax, px", "parallax", show=[False, True, False]),
         plot("Landmarks: carried, measured, converged", [f"{root}/count"]),
         plot("ω, rad/s, and V, m/s", [f"{root}/inputs/omega", f"{root}/inputs/speed"]),
-        grid_columns=2, name="All",
-    )  # fmt: skip
+        grid_columns=2,
+        name="All",
+    )
     tabs = [
         rrb.Grid(
             *(
@@ -224,6 +232,12 @@ def _landmark_plots(root: str, bounds: Bounds) -> rrb.Tabs:
         for slot, name, top in bounds.landmarks
     ]
     return rrb.Tabs(all_of_them, *tabs, active_tab=1 if tabs else 0)
+
+
+def _slot_colour(slot: int) -> int:
+    """RGBA of a landmark's slot, hues by the golden section."""
+    rgb = colorsys.hsv_to_rgb((0.57 + slot * 0.618) % 1, 0.6, 0.95)
+    return sum(int(c * 255) << shift for c, shift in zip(rgb, (24, 16, 8), strict=True)) | 0xFF
 
 
 def _panels() -> Sequence[Any]:

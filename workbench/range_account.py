@@ -10,7 +10,7 @@ import math
 from array import array
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -19,11 +19,13 @@ from scipy.stats import chi2
 from pipelines.lens import undistorted
 from pipelines.ranging.filter import Outcome, Status
 from pipelines.ranging.landmarks.frames import seen_px
+from pipelines.ranging.landmarks.settings import BoardSettings, LandmarkKind, MarkerSettings
 from pipelines.ranging.reference import PoseTrack, ReferenceRanges
 from pipelines.ranging.step import RangeStep
 from readers.streams import Camera, Landmark, StreamKind
 from workbench.inputs import Reference
 from workbench.range_traces import Beside, RangeScene
+from workbench.settings import Resolved
 from workbench.summary import Tally, range_suitability
 
 if TYPE_CHECKING:
@@ -99,39 +101,42 @@ class RangeAccount:
     @classmethod
     def of(
         cls,
-        settings: Any,
-        camera: Camera | None,
+        resolved: Resolved,
         landmarks: Mapping[int, Landmark],
         reference: Reference,
         streams: Streams,
         offset_ns: int,
     ) -> RangeAccount:
         """The account of a replay with these settings and this reference."""
+        settings: Any = resolved.settings
         bearings = streams.kind is StreamKind.LANDMARKS
         body_t_camera = np.eye(4)
         body_t_camera[:3, :3] = settings.body_r_camera
         body_t_camera[:3, 3] = settings.camera_position_m or (0.0, 0.0, 0.0)
         poses = PoseTrack(MAX_GAP_S)
-        posed = None if camera is None and not bearings else _placed(camera, body_t_camera)
+        own = None if bearings else settings.camera
+        board = _board_of(resolved)
         ranges = ReferenceRanges(
-            posed, landmarks=landmarks, pose_stream=reference.stream or "none", max_gap_s=MAX_GAP_S
+            _placed(own, body_t_camera),
+            landmarks=landmarks,
+            pose_stream=reference.stream or "none",
+            board=board,
+            max_gap_s=MAX_GAP_S,
         )
         for pose in reference.poses:
             poses.add(pose.t_ns, pose.position_m, pose.quat_xyzw)
             ranges.take(pose)
-        own = camera if camera is not None and not bearings and settings.focal_px == camera.matrix[0, 0] else None
-        size = getattr(settings, "image_size_px", None)
         centre = settings.pinhole_centre_px
         scene = RangeScene(
             focal_px=settings.pinhole_focal_px,
             centre_px=centre,
-            image_px=_canvas(size, centre, bearings),
+            image_px=_canvas(settings.image_size_px, centre, bearings),
             surveyed={number: one.position_m for number, one in landmarks.items()} if reference.poses else {},
             referenced=bool(reference.poses),
         )
         if own is not None and not undistorted(own):
             scene = dataclasses.replace(scene, on_image=lambda points: _seen(own, points))
-        sentence = _sentence(reference, landmarks, bearings)
+        sentence = _sentence(reference, landmarks, bearings, board is not None)
         return cls(scene, ranges, poses, body_t_camera, sentence, offset_ns, 1 if bearings else 2)
 
     # ---- step by step
@@ -148,7 +153,7 @@ class RangeAccount:
         self._converged += step.converged
         for slot in np.flatnonzero(ids >= 0).tolist():
             self._follow(self._lives.setdefault(int(ids[slot]), Life()), step, slot, float(depth[slot]))
-        return Beside(self._camera_at(step.t_ns + self._offset_ns), depth)
+        return Beside(self._poses.at(step.t_ns + self._offset_ns) @ self._body_t_camera, depth)
 
     def _follow(self, life: Life, step: RangeStep, slot: int, depth_m: float) -> None:
         life.frames += 1
@@ -175,12 +180,6 @@ class RangeAccount:
         squared = float((xi - 1 / depth_m) ** 2 / variance)
         life.nees += squared
         life.covered += squared <= COVERED_SIGMAS**2
-
-    def _camera_at(self, t_ns: int) -> Floats:
-        """x, y (m) and heading (rad) of the optical axis, by the reference; NaN where unknown."""
-        world_t_camera = self._poses.at(t_ns) @ self._body_t_camera
-        x, y = world_t_camera[:2, 3]
-        return np.array([x, y, math.atan2(world_t_camera[1, 2], world_t_camera[0, 2])])
 
     # ---- the end
 
@@ -286,13 +285,25 @@ def _seen(camera: Camera, points_px: Floats) -> Floats:
     return seen
 
 
-def _sentence(reference: Reference, landmarks: Mapping[int, Landmark], bearings: bool) -> str:
+def _board_of(resolved: Resolved) -> BoardSettings | MarkerSettings | None:
+    """The board whose pose tells ranges: where its size was given."""
+    settings: Any = resolved.settings
+    if settings.landmarks is LandmarkKind.CHESSBOARD and "board" in resolved.given:
+        return cast(BoardSettings, settings.board)
+    if settings.landmarks is LandmarkKind.ARUCO and "markers" in resolved.given:
+        return cast(MarkerSettings, settings.markers)
+    return None
+
+
+def _sentence(reference: Reference, landmarks: Mapping[int, Landmark], bearings: bool, board: bool) -> str:
     """What the reference ranges come from."""
     parts = []
     if landmarks and reference.poses:
         parts.append(f"{len(landmarks)} surveyed landmarks and the poses of {reference.stream}")
     if bearings:
         parts.append("the ranges that were measured with the bearings")
+    if board:
+        parts.append("the pose of the board, whose size was given")
     if parts:
         return ", else ".join(parts)
     if landmarks:

@@ -79,11 +79,11 @@ class Beside(NamedTuple):
     """What the reference says at a frame.
 
     Attributes:
-        camera: x, y (m) and heading (rad) of the optical axis from above [3]; NaN where unknown.
+        world_t_camera: pose of the camera [4, 4]; NaN where unknown.
         depth_m: along the optical axis to the landmark in each slot [N]; NaN where unknown.
     """
 
-    camera: Floats
+    world_t_camera: Floats
     depth_m: Floats
 
 
@@ -143,6 +143,18 @@ def dead_reckoned(table: Columns, start: Floats) -> Floats:
     return np.column_stack([x, y, heading])
 
 
+def level(poses: Floats) -> Floats:
+    """`world_t_camera` [n, 4, 4] of level cameras at x, y, heading [n, 3]."""
+    cosine, sine = np.cos(poses[:, 2]), np.sin(poses[:, 2])
+    cameras = np.zeros((len(poses), 4, 4))
+    cameras[:, :2, 0] = np.column_stack([sine, -cosine])
+    cameras[:, 2, 1] = -1
+    cameras[:, :2, 2] = np.column_stack([cosine, sine])
+    cameras[:, :2, 3] = poses[:, :2]
+    cameras[:, 3, 3] = 1
+    return cameras
+
+
 class Above(NamedTuple):
     """Landmarks from above, m of them, step by step.
 
@@ -165,46 +177,46 @@ class Above(NamedTuple):
     angle: Floats
 
 
-def from_above(table: Columns, camera: Floats, scene: RangeScene) -> Above:
-    """The landmarks of n steps from cameras at x, y, heading [n, 3]."""
-    mean, status = table["mean"], table["status"]
-    depth = table["range_m"]
-    seen = finite(mean, 2) & np.isfinite(depth) & (depth > 0) & finite(camera, 1)[:, None]
+def from_above(table: Columns, cameras: Floats, scene: RangeScene) -> Above:
+    """The landmarks of n steps from cameras with the poses `world_t_camera` [n, 4, 4]."""
+    mean, status, depth = table["mean"], table["status"], table["range_m"]
+    seen = finite(mean, 2) & np.isfinite(depth) & (depth > 0) & finite(cameras, (1, 2))[:, None]
     seen &= np.asarray(status != Status.LOST)
-    place = np.broadcast_to(camera[:, None, :], (*depth.shape, 3))[seen]
-    left = -(mean[seen][:, 0] - scene.centre_px[0]) / scene.focal_px
-    turn = _turns(place[:, 2])
-    direction = np.einsum("mij,mj->mi", turn, np.column_stack([np.ones_like(left), left]))
+    which = np.nonzero(seen)[0]
+    turn, place = cameras[which, :2, :3], cameras[which, :2, 3]
+    aside = (mean[seen][:, :2] - scene.centre_px) / scene.focal_px
+    direction = np.einsum("mij,mj->mi", turn, np.column_stack([aside, np.ones(len(aside))]))
     z = depth[seen]
     near, far = table["range_interval_m"][seen].T
     ends = np.stack([near, np.fmin(far, LONGEST_RAY * z)], axis=1)
-    sure = table["relative_sigma"][seen] < ELLIPSE_SIGMA
-    half, angle = _ellipses(table["covariance"][seen], mean[seen][:, 2], left, turn, scene.focal_px)
+    half, angle = _ellipses(table["covariance"][seen], mean[seen][:, 2], aside, turn, scene.focal_px)
     return Above(
         counts=seen.sum(axis=1),
-        points=place[:, :2] + z[:, None] * direction,
-        rays=place[:, None, :2] + ends[:, :, None] * direction[:, None, :],
+        points=place + z[:, None] * direction,
+        rays=place[:, None, :] + ends[:, :, None] * direction[:, None, :],
         colours=status_colours(status[seen]),
-        sure=np.asarray(sure, np.bool_),
+        sure=np.asarray(table["relative_sigma"][seen] < ELLIPSE_SIGMA, np.bool_),
         half_axes=half,
         angle=angle,
     )
 
 
-def _turns(heading: Floats) -> Floats:
-    cosine, sine = np.cos(heading), np.sin(heading)
-    return np.stack([np.stack([cosine, -sine], -1), np.stack([sine, cosine], -1)], -2)
+def _ellipses(covariance: Floats, xi: Floats, aside: Floats, turn: Floats, focal_px: float) -> tuple[Floats, Floats]:
+    """Half axes [m, 2] and direction [m] of the 2σ ellipses of (a, b, 1)/ξ from above, by its derivative with X.
 
-
-def _ellipses(covariance: Floats, xi: Floats, left: Floats, turn: Floats, focal_px: float) -> tuple[Floats, Floats]:
-    """Half axes [m, 2] and direction [m] of the 2σ ellipses of (1/ξ, left/ξ), by its derivative with x and ξ."""
-    jacobian = np.zeros((len(xi), 2, 2))
-    jacobian[:, 0, 1] = -1 / xi**2
-    jacobian[:, 1, 0] = -1 / (focal_px * xi)
-    jacobian[:, 1, 1] = -left / xi**2
+    Args:
+        covariance: P [m, 3, 3].
+        xi: ξ [m].
+        aside: a, b = (x - c)/f [m, 2].
+        turn: first two rows of `world_r_camera` [m, 2, 3].
+        focal_px: f.
+    """
+    jacobian = np.zeros((len(xi), 3, 3))
+    jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1 / (focal_px * xi)
+    jacobian[:, :2, 2] = -aside / xi[:, None] ** 2
+    jacobian[:, 2, 2] = -1 / xi**2
     full = turn @ jacobian
-    spread = full @ covariance[:, ::2, ::2] @ np.swapaxes(full, 1, 2)
-    values, vectors = np.linalg.eigh(np.nan_to_num(spread))
+    values, vectors = np.linalg.eigh(np.nan_to_num(full @ covariance @ np.swapaxes(full, 1, 2)))
     return 2 * np.sqrt(values.clip(0)), np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0])
 
 

@@ -100,13 +100,13 @@ class RangeDrawing(Drawing):
 
     def write(self, table: traces.Columns, beside: Sequence[Any]) -> None:  # noqa: D102
         n, total = table["landmark_id"].shape
-        nothing = Beside(np.full(3, np.nan), np.full(total, np.nan))
+        nothing = Beside(np.full((4, 4), np.nan), np.full(total, np.nan))
         known: list[Beside] = [nothing if one is None else one for one in beside]
         reference = np.array([one.depth_m for one in known]).reshape(n, total)
-        camera = np.array([one.camera for one in known])
+        camera = np.array([one.world_t_camera for one in known])
         if not self.scene.referenced:
-            camera = ranges.dead_reckoned(table, self._reckoned)
-            self._reckoned = camera[-1]
+            poses = ranges.dead_reckoned(table, self._reckoned)
+            self._reckoned, camera = poses[-1], ranges.level(poses)
         self._remember(table, camera, reference)
         self._on_image(table)
         self._from_above(table, camera)
@@ -181,9 +181,9 @@ class RangeDrawing(Drawing):
         rays = rr.LineStrips3D.columns(strips=strips, colors=faint)
         self.send(f"{world}/rays", table, rays.partition(above.counts))
         self._ellipses(f"{world}/ellipses", table, above)
-        known = traces.finite(camera, 1)
+        known = traces.finite(camera, (1, 2))
         there = {"frame": table["frame"][known], "t_ns": table["t_ns"][known]}
-        columns = rr.Points3D.columns(positions=flat(camera[known, :2], "markers"))
+        columns = rr.Points3D.columns(positions=flat(camera[known, :2, 3], "markers"))
         self.send(f"{self.world}/camera", there, columns)
 
     def _ellipses(self, entity: str, table: traces.Columns, above: ranges.Above) -> None:
@@ -220,17 +220,17 @@ class RangeDrawing(Drawing):
         if not self._path:
             return {}
         frames, t_ns, camera = (np.concatenate(column) for column in zip(*self._path, strict=True))
-        good = traces.finite(camera, 1)
+        good = traces.finite(camera, (1, 2))
+        way, ahead = camera[good, :2, 3], camera[good, :2, 2]
         surveyed = np.array([place[:2] for place in self.scene.surveyed.values()]).reshape(-1, 2)
-        shown = [camera[good, :2], surveyed, _bulk(np.concatenate(self._reach))]
+        shown = [way, surveyed, _bulk(np.concatenate(self._reach))]
         extent = Extent.of(np.concatenate([*shown, *([] if given is None else [given.corners])]))
         name = "reference" if self.scene.referenced else "corrected"
-        line = rr.LineStrips3D([flat(camera[good, :2], name)], colors=COLOURS[name], radii=rr.Radius.ui_points(0.8))
+        line = rr.LineStrips3D([flat(way, name)], colors=COLOURS[name], radii=rr.Radius.ui_points(0.8))
         self.file.static(f"{self.world}/camera/path", line)
         self.file.scale_bar(extent)
-        heading = camera[good, 2]
-        vectors = ARROW_SHARE * extent.size_m * np.column_stack([np.cos(heading), np.sin(heading)])
-        arrows = rr.Arrows3D.columns(vectors=flat(vectors), origins=flat(camera[good, :2], "arrows"))
+        vectors = flat(ARROW_SHARE * extent.size_m * ahead)
+        arrows = rr.Arrows3D.columns(vectors=vectors, origins=flat(way, "arrows"))
         self.file.send(f"{self.world}/camera/heading", frames[good], t_ns[good], arrows)
         self.file.static(f"{self.root}/slots", document(self._slot_table()))
         return {"extent": extent, "landmarks": self._landmarks()}

@@ -348,7 +348,7 @@ def _choose_for_ranges(request: Request, recording: Recording, resolved: Resolve
     camera = range_inputs.camera_of(recording, streams)
     resolved, notes = range_inputs.with_camera(resolved, recording, camera, streams)
     landmarks = range_inputs.landmarks_of(recording)
-    account = RangeAccount.of(resolved.settings, camera, landmarks, reference, streams, offset_ns)
+    account = RangeAccount.of(resolved, landmarks, reference, streams, offset_ns)
     return _Chosen(
         frames=streams.frames,
         others=streams.others,
