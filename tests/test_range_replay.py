@@ -78,9 +78,9 @@ def test_what_cannot_be_chosen_is_named_with_the_cure() -> None:
     with pytest.raises(StreamError, match=r"several track streams: /front/tracks, /rear/tracks; choose .*--tracks"):
         chosen(two)
     assert chosen(two, tracks="/rear/tracks").frames == "/rear/tracks"
-    with pytest.raises(StreamError, match="several odometry streams.*--odometry"):
+    with pytest.raises(StreamError, match=r"several odometry streams.*--odometry"):
         chosen(EVERYTHING | {"/visual/odometry": StreamKind.ODOMETRY})
-    with pytest.raises(StreamError, match="several IMU streams.*--imu"):
+    with pytest.raises(StreamError, match=r"several IMU streams.*--imu"):
         chosen(EVERYTHING | {"/imu2": StreamKind.IMU})
     with pytest.raises(StreamError, match="no odometry, and ranges come from known speeds alone"):
         chosen({TRACKS: StreamKind.TRACK, IMU: StreamKind.IMU})
@@ -181,7 +181,7 @@ def test_errors_consistency_and_waits_are_what_they_were_made() -> None:
         for s, counts in zip(steps, told, strict=True) if counts
     ]  # fmt: skip
     assert one["error"]["median_percent"] == pytest.approx(100 * float(np.median(expected)))
-    nis = np.array([step.nis for step in steps])
+    nis = np.array([step.nis for step in steps]).clip(max=13.8)  # a blunder counts as the gate
     assert found["nis"]["mean"] == pytest.approx(float(np.nanmean(nis)))
     assert found["nis"]["low"] < 2 < found["nis"]["high"]
     assert account_of(steps, 3.0)["ranging"]["error"]["coverage"] == 0.0

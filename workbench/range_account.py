@@ -24,7 +24,7 @@ from pipelines.ranging.reference import PoseTrack, ReferenceRanges
 from pipelines.ranging.step import RangeStep
 from readers.streams import Camera, Landmark, StreamKind
 from workbench.inputs import Reference
-from workbench.range_traces import Beside, RangeScene
+from workbench.range_traces import GATE, Beside, RangeScene
 from workbench.settings import Resolved
 from workbench.summary import Tally, range_suitability
 
@@ -48,7 +48,8 @@ class Life:
     """All that is kept of one landmark, over all of its starts.
 
     `errors` are relative errors of its range in the frames in which the range counted and the reference knew it, 8
-    bytes each; `nees` sums (ξ - 1/Z)²/P_ξξ over them.
+    bytes each; `nees` sums (ξ - 1/Z)²/P_ξξ over them. `nis` sums the NIS, of which one above the gate counts as the
+    gate: single blunders are told by their number.
     """
 
     frames: int = 0
@@ -165,7 +166,7 @@ class RangeAccount:
         life.losses += bool(outcome == Outcome.LOST)
         if math.isfinite(nis):
             life.updates += 1
-            life.nis += float(nis)
+            life.nis += min(float(nis), GATE)
         if step.status[slot] != Status.CONVERGED:
             return
         life.converged += 1

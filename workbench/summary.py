@@ -341,7 +341,11 @@ def _range_lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [
         ("landmarks", f"{found['landmarks']} in {found['starts']} starts; {counts}"),
         ("converged", f"{found['converged_landmarks']} landmarks{wait}; {percent(found['converged_share'])} of ranges"),
-        ("NIS", f"mean {nis['mean']:.3g}; {nis['expected']:.0f} expected, 95 % in {nis['low']:.3g}…{nis['high']:.3g}"),
+        (
+            "NIS",
+            f"mean {nis['mean']:.3g}, none counted above 13.8; {nis['expected']:.0f} expected, "
+            f"95 % in {nis['low']:.3g}…{nis['high']:.3g}",
+        ),
         ("reference", summary["reference"]),
     ]
     if found["error"] is not None:
