@@ -158,7 +158,7 @@ class Together:
         spread[measured] = prior[measured, :2, :2] + variance[measured, None, None] * np.eye(2)
         gain = np.full((len(prior), 3, 2), np.nan)
         gain[measured] = prior[measured, :, :2] @ np.linalg.inv(spread[measured])
-        likelihood = -0.5 * (done.nis + np.log(np.linalg.det(spread))) - eq.LOG_2PI
+        likelihood = -0.5 * (done.nis + np.log(spread[:, 0, 0] * spread[:, 1, 1] - spread[:, 0, 1] ** 2)) - eq.LOG_2PI
         mean, blocks = after.mean, after.blocks
         sigma = np.sqrt(blocks[:, 2, 2])
         near, far = eq.range_interval(mean[:, 2], sigma)

@@ -6,6 +6,7 @@ a principal point or pitch that is off, leave no trace in the innovations.
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -31,7 +32,7 @@ CAP = 13.8
 TURNING_RADPS = 0.02
 """Rms rate of turn below which innovations that follow it tell nothing."""
 FOLLOWS = 0.8
-"""Correlation of the innovations in x with the rate of turn that is taken for a delay."""
+"""Correlation of the innovations in x with the rate of turn and its change that is taken for a delay."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,13 +87,37 @@ class Trends:
         )
 
 
-class Turning(NamedTuple):
-    """Running means of ν_x ω, ν_x² and ω², with ν_x the frame's mean whitened innovation in x; `frames` of them."""
+ROTATION_SHARE = 0.1
+"""Derotated parallax over raw parallax below which the landmarks have moved by rotation alone."""
 
-    both: float = 0.0
-    innovation: float = 0.0
+
+class Turning(NamedTuple):
+    """Running second moments of (ν_x, ω, Δω), row by row, and the last ω.
+
+    ν_x is the frame's median whitened innovation in x, Δω the change of the rate of turn since the frame before: a
+    delay of the images shifts x by f ω delay, which the filter takes up in part from frame to frame.
+    """
+
+    moments: tuple[float, ...] = (0.0,) * 9
     omega: float = 0.0
     frames: int = 0
+
+    def taking(self, innovation: float, omega: float, keep: float) -> Turning:
+        """With one frame."""
+        row = (innovation, omega, omega - self.omega)
+        new = tuple(
+            keep * old + (1.0 - keep) * x * y
+            for old, (x, y) in zip(self.moments, itertools.product(row, row), strict=True)
+        )
+        return Turning(new, omega, self.frames + 1)
+
+    @property
+    def correlation(self) -> float:
+        """Multiple correlation of ν_x with ω and Δω, 0…1; 0 where it does not turn or the innovations are small."""
+        m = np.array(self.moments).reshape(3, 3)
+        if m[1, 1] < TURNING_RADPS**2 or m[0, 0] < 1.0:
+            return 0.0
+        return float(np.sqrt(m[0, 1:] @ np.linalg.pinv(m[1:, 1:]) @ m[1:, 0] / m[0, 0]))
 
 
 @dataclass(frozen=True, slots=True)
@@ -113,13 +138,7 @@ class History:
         white = white[np.isfinite(white)]
         turning = self.turning
         if len(white):
-            x, keep = float(np.clip(np.median(white), -4.0, 4.0)), 1.0 - 2.0 / kept
-            turning = Turning(
-                keep * turning.both + (1 - keep) * x * omega,
-                keep * turning.innovation + (1 - keep) * x * x,
-                keep * turning.omega + (1 - keep) * omega * omega,
-                turning.frames + 1,
-            )
+            turning = turning.taking(float(np.clip(np.median(white), -4.0, 4.0)), omega, 1.0 - 2.0 / kept)
         return replace(self, nis=(*self.nis, *level)[-kept:], dt_s=(*self.dt_s, dt_s)[-kept:], turning=turning)
 
 
@@ -170,7 +189,8 @@ def _alarms_of_parallax(s: RangeSettings, update: Update, old: NDArray[np.bool_]
     derotated, raw = update.derotated_parallax_px[old], update.parallax_px[old]
     if (derotated < s.min_parallax_px).all():
         alarms |= Verdict.LOW_PARALLAX
-        if np.median(raw) > s.rotation_parallax_px:
+        moved = float(np.median(raw))
+        if moved > s.rotation_parallax_px and np.median(derotated) < ROTATION_SHARE * moved:
             alarms |= Verdict.PURE_ROTATION
     uncertain = ~(update.relative_sigma[old] < s.max_relative_sigma)
     if (uncertain & (update.focus_distance_px[old] < s.focus_limit_px)).any():
@@ -205,9 +225,6 @@ def _alarms_of_trends(s: RangeSettings, trends: Trends, history: History) -> Ver
         alarms |= Verdict.INNOVATIONS_ONE_SIDED
     if old.any() and (np.median(trends.product[old], axis=0) < -limit).any():
         alarms |= Verdict.INNOVATIONS_ALTERNATE
-    turning = history.turning
-    power = turning.innovation * turning.omega
-    telling = turning.frames >= 2 * TREND_UPDATES and turning.omega > TURNING_RADPS**2 and turning.innovation > 1.0
-    if telling and abs(turning.both) > FOLLOWS * power**0.5:
+    if history.turning.frames >= 2 * TREND_UPDATES and history.turning.correlation > FOLLOWS:
         alarms |= Verdict.INNOVATIONS_FOLLOW_TURN
     return alarms

@@ -113,6 +113,7 @@ class RangeSettings(FilterSettings, LandmarkSettings):
     zero_velocity_update: bool = Field(True, description="V = 0 without error while the robot stands")
     standstill_s: Positive = Field(1.0, description="the robot stands if its speed was noise alone for so long")
     standstill_sigmas: Positive = Field(3.0, description="… on every shorter end of that time too, in σ_V/√T")
+    standstill_limit_mps: Positive = Field(0.03, description="… and a robot whose mean speed is above does not stand")
 
     # start
     start: StartKind = Field(StartKind.BROAD, description="what is known of a new landmark's range")

@@ -217,7 +217,8 @@ def _windowed(s: RangeSettings, window: Signal) -> Signal:
 def stands(s: RangeSettings, window: Signal) -> bool:
     """Whether the robot stands: over every end of the window the way is what noise alone makes, |Σ Ṽ dt| ≤ n σ_V √T.
 
-    The ends catch a start at once that the whole window would average away.
+    The ends catch a start at once that the whole window would average away. Over the whole window the mean speed must
+    be below `standstill_limit_mps` too: with a bad odometer a crawl is within the noise, and is no stop.
     """
     if not _lasts(s, window):
         return False
@@ -229,7 +230,7 @@ def stands(s: RangeSettings, window: Signal) -> bool:
         x, y, z = x + vx * dt, y + vy * dt, z + vz * dt
         if x * x + y * y + z * z > limit * (t_ns[-1] - t_ns[k - 1]):
             return False
-    return True
+    return math.hypot(x, y, z) <= s.standstill_limit_mps * (t_ns[-1] - t_ns[0]) * NS
 
 
 # ----------------------------------------------------------------------------- a frame
