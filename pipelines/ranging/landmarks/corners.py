@@ -3,20 +3,20 @@
 A corner is where the smaller eigenvalue of the gradients' second moments has a maximum (Shi, Tomasi, "Good features
 to track", CVPR 1994). A track goes on while Lucas-Kanade finds it again, forth and, to within a threshold, back to
 where it was; a corner that another object comes before, or that leaves the image, fails that. Tracks are from frame to
-frame, so that their errors add up slowly: σ grows with the age of a track, not with the size of the motion.
+frame, so that their errors add up with age; a corner begins where a window that grows does not drift (`centred`),
+which makes them several times smaller on the way towards a wall.
 
 OpenCV's corners and tracks were the same, bit for bit, for any number of its threads; nothing is set.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import cv2
 import numpy as np
 from numpy.typing import NDArray
+from scipy.spatial import cKDTree
 
 from pipelines.ranging.landmarks.frames import NOTHING, Grey, grey_of, ideal_px, is_frame, sighting
 from pipelines.ranging.landmarks.settings import CornerSettings
@@ -26,6 +26,11 @@ from readers.streams import Camera, Sample
 Floats = NDArray[np.float64]
 Singles = NDArray[np.float32]
 Longs = NDArray[np.int64]
+
+CENTRINGS = 5
+"""Steps to a corner's centre; the last ones change nothing."""
+SPARE = 4
+"""Corners that are centred for each one that is needed: some lie on edges or come together."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -89,23 +94,17 @@ class TrackedCorners:
         if before is None or before.shape != grey.shape or not len(state.ids):
             return CornerState(grey, next_id=state.next_id)
         s = self.settings
-        size = (s.window_px, s.window_px)
-        first, second = (
-            cv2.buildOpticalFlowPyramid(image, size, s.levels, withDerivatives=True)[1]
-            for image in (evened(before, grey, s.exposure_jump), grey)
-        )
-        points, found, residual = self._lucas_kanade(first, second, state.points_px)
-        back, found_back, _ = self._lucas_kanade(second, first, points)
+        evened_before = evened(before, grey, s.exposure_jump)
+        points, found, residual = self._lucas_kanade(evened_before, grey, state.points_px)
+        back, found_back, _ = self._lucas_kanade(grey, evened_before, points)
         error = np.linalg.norm(back.astype(np.float64) - state.points_px, axis=1)
         good = found & found_back & (error <= s.forward_backward_px) & (residual <= s.max_residual_grey)
         good &= inside(points, grey.shape, s.border_px)
         good[good] = _apart(points[good], 0.5 * s.min_distance_px)
         return CornerState(grey, state.ids[good], points[good], state.age[good] + 1, error[good], state.next_id)
 
-    def _lucas_kanade(
-        self, first: Sequence[Any], second: Sequence[Any], points: Singles
-    ) -> tuple[Singles, NDArray[np.bool_], Floats]:
-        """Where points [n, 2] of one pyramid are in another, whether they were found, and mean grey differences [n]."""
+    def _lucas_kanade(self, first: Grey, second: Grey, points: Singles) -> tuple[Singles, NDArray[np.bool_], Floats]:
+        """Where points [n, 2] of one image are in another, whether they were found, and mean grey differences [n]."""
         s = self.settings
         ends = (cv2.TERM_CRITERIA_COUNT | cv2.TERM_CRITERIA_EPS, s.max_iterations, s.tolerance_px)
         moved, status, residual = cv2.calcOpticalFlowPyrLK(
@@ -125,7 +124,7 @@ class TrackedCorners:
     def _replenished(self, state: CornerState) -> CornerState:
         """With new corners, where there are too few tracks."""
         s = self.settings
-        if state.grey is None or len(state.ids) >= s.replenish_below * s.max_corners:
+        if state.grey is None or len(state.ids) >= max(1.0, s.replenish_below * s.max_corners):
             return state
         new = self._corners(state.grey, state.points_px)
         n = len(new)
@@ -146,20 +145,45 @@ class TrackedCorners:
         free[edge : grey.shape[0] - edge, edge : grey.shape[1] - edge] = 255
         for u, v in taken:
             cv2.circle(free, (round(float(u)), round(float(v))), round(s.min_distance_px), 0, -1)
-        textured = cv2.cornerMinEigenVal(grey, s.block_px) >= least_eigenvalue(s.min_texture)
-        free[~textured] = 0
-        best = cv2.goodFeaturesToTrack(grey, 0, s.quality, s.min_distance_px, mask=free, blockSize=s.block_px)
+        best = cv2.goodFeaturesToTrack(grey, 0, s.quality, s.min_distance_px, mask=free, blockSize=s.window_px)
         if best is None:
             return np.zeros((0, 2), dtype=np.float32)
-        return _spread(best.reshape(-1, 2), taken, grey.shape, s)
+        room = max(s.max_corners - len(taken), 0)
+        chosen = _spread(best.reshape(-1, 2), taken, grey.shape, s)[: SPARE * room]
+        points, texture = centred(grey, chosen, s.window_px)
+        near = np.linalg.norm(points - chosen, axis=1) <= 0.5 * s.window_px
+        points = points[near & (texture >= s.min_texture) & inside(points, grey.shape, s.border_px)]
+        kept: Singles = points[_apart(points, 0.5 * s.min_distance_px)][:room]
+        return kept
 
 
-def least_eigenvalue(texture: float) -> float:
-    """What OpenCV's `cornerMinEigenVal` gives of 8-bit images for an rms gradient in grey levels per px.
+def centred(grey: Grey, points: Singles, window_px: int) -> tuple[Singles, Floats]:
+    """Points [n, 2] moved to where a window about them can grow without drifting, and the texture there [n].
 
-    λ = (2 g / 255)²: the mean square of central differences over two px, of grey levels from 0 to 1.
+    Lucas-Kanade shifts a window until Σ g gᵀ (motion - shift) = 0, g the gradients in it. As the scene comes nearer by
+    a share s, a place q moves by s (q - c) from the point c, so that the shift is 0 where Σ g gᵀ (q - c) = 0: then c
+    stays the same point of the scene. It is the point to which `cornerSubPix` (Förstner, Gülch, 1987) leads, with the
+    equal weights of the tracker's window.
+
+    The texture is the rms gradient along the direction in which it is weakest, grey levels per px.
     """
-    return (2.0 * texture / 255.0) ** 2
+    gradients = [cv2.Scharr(grey, cv2.CV_32F, dx, dy, scale=1 / 32) for dx, dy in ((1, 0), (0, 1))]
+    half = window_px // 2
+    v, u = np.mgrid[-half : half + 1, -half : half + 1]
+    last = np.array([grey.shape[1] - 1, grey.shape[0] - 1]) - half
+    moved = points.astype(np.float64)
+    for _ in range(CENTRINGS):
+        at = np.rint(moved).astype(np.int64).clip(half, last)
+        window = (at[:, 1, None, None] + v, at[:, 0, None, None] + u)
+        gu, gv = (gradient[window].astype(np.float64) for gradient in gradients)
+        uu, uv, vv, along, down = (
+            product.sum(axis=(1, 2))
+            for product in (gu * gu, gu * gv, gv * gv, gu * (gu * u + gv * v), gv * (gu * u + gv * v))
+        )
+        det = np.maximum(uu * vv - uv * uv, 1e-12)
+        moved = at + np.column_stack([vv * along - uv * down, uu * down - uv * along]) / det[:, None]
+    weakest = 0.5 * (uu + vv) - np.hypot(0.5 * (uu - vv), uv)
+    return moved.astype(np.float32), np.sqrt(weakest.clip(min=0) / window_px**2)
 
 
 def evened(before: Grey, now: Grey, jump: float) -> Grey:
@@ -181,15 +205,15 @@ def inside(points: Singles, shape: tuple[int, ...], border_px: float) -> NDArray
 
 def _apart(points: Singles, distance_px: float) -> NDArray[np.bool_]:
     """Which points [n, 2] stay when of two that are too close to each other the later one goes."""
-    close = np.linalg.norm(points[:, None].astype(np.float64) - points[None], axis=2) < distance_px
     stay = np.ones(len(points), dtype=bool)
-    for number in range(1, len(points)):
-        stay[number] = not np.any(close[number, :number] & stay[:number])
+    pairs = cKDTree(points).query_pairs(distance_px) if len(points) else ()
+    for first, second in sorted(pairs):
+        stay[second] &= not stay[first]
     return stay
 
 
 def _spread(best: Singles, taken: Singles, shape: tuple[int, ...], s: CornerSettings) -> Singles:
-    """As many of the corners [n, 2], best first, as there is room for, in the emptiest cells of the grid first.
+    """The corners [n, 2], which come best first, in the order of their turn: in the emptiest cells of the grid first.
 
     Round by round every cell that has fewest tracks takes its next best corner, so that texture in one place does
     not take all tracks.
@@ -206,5 +230,4 @@ def _spread(best: Singles, taken: Singles, shape: tuple[int, ...], s: CornerSett
     for number, where in enumerate(cell):
         rank[number] = occupancy[where]
         occupancy[where] += 1
-    order = np.lexsort((np.arange(len(best)), rank))
-    return best[order[: max(s.max_corners - len(taken), 0)]]
+    return best[np.argsort(rank, kind="stable")]

@@ -56,21 +56,24 @@ class CornerSettings(_Frozen):
     min_texture: NotNegative = Field(
         2.0, description="grey levels per px: rms gradient along a corner's weaker direction, below it is no corner"
     )
-    block_px: Annotated[int, Field(ge=3, le=31)] = Field(7, description="side of the window of that, odd")
     min_distance_px: Positive = Field(12.0, description="between a new corner and any other")
     border_px: NotNegative = Field(12.0, description="from the image's edge; a track that comes closer ends")
     grid_columns: Annotated[int, Field(ge=1)] = Field(8, description="cells that the image is divided into")
     grid_rows: Annotated[int, Field(ge=1)] = Field(6, description="… down")
-    replenish_below: Fraction = Field(0.8, description="share of max_corners under which new corners are looked for")
+    replenish_below: Fraction = Field(
+        0.8, description="share of max_corners under which new ones are looked for; 0: when none is left"
+    )
 
     # tracking
-    window_px: Annotated[int, Field(ge=5, le=63)] = Field(21, description="side of the tracked window, odd")
+    window_px: Annotated[int, Field(ge=5, le=63)] = Field(
+        15, description="side of the window that is tracked, and that a corner is chosen for; odd"
+    )
     levels: Annotated[int, Field(ge=0, le=8)] = Field(3, description="halvings of the image; each doubles the reach")
     max_iterations: Annotated[int, Field(ge=1, le=100)] = Field(30, description="of Lucas-Kanade at each level")
     tolerance_px: Positive = Field(0.01, description="the iteration ends below this step")
     min_eigenvalue: NotNegative = Field(1e-4, description="OpenCV's minEigThreshold: a flatter window is lost")
     forward_backward_px: Positive = Field(
-        0.5, description="a track that does not come back this close to where it started ends"
+        0.3, description="a track that does not come back this close to where it started ends"
     )
     max_residual_grey: Positive = Field(
         20.0, description="mean difference of the window before and after, grey levels, that ends a track"
@@ -85,7 +88,7 @@ class CornerSettings(_Frozen):
         "fixed", description="residual: sigma_px and the forward-backward distance, as a sum of variances"
     )
 
-    @field_validator("block_px", "window_px")
+    @field_validator("window_px")
     @classmethod
     def _odd(cls, side: int) -> int:
         if side % 2 == 0:
