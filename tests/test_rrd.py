@@ -249,8 +249,7 @@ def test_a_killed_process_loses_less_than_the_last_second(tmp_path: Path) -> Non
 _ENDLESS = textwrap.dedent(
     """
     import sys, time
-    import fake_ranges
-import fake_steps
+    import fake_steps
     from test_rrd import run_writer
     writer = run_writer(sys.argv[1])
     for step in fake_steps.steps(100_000):

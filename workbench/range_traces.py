@@ -35,6 +35,8 @@ NEAR_M, FAR_M = 0.5, 50.0
 """Ends of the colours of range, which are logarithmic between."""
 LONGEST_RAY = 3.0
 """A ray of a range that is not known ends at so many times the range."""
+FARTHEST_FOCUS_PX = 1000.0
+"""A landmark farther from the focus of expansion has no such line in its plot."""
 ELLIPSE_SIGMA = 0.3
 """σ_ξ/ξ up to which an ellipse says what is known; beyond, only the ray does."""
 
@@ -291,10 +293,16 @@ def plotted(table: Columns, reference_m: Floats, slots: int) -> dict[str, Floats
             "nis": table["nis"][at][..., None],
             "gain": table["gain"][at].reshape(*xi.shape, 6),
             "parallax": np.stack(
-                [table[f"{name}_px"][at] for name in ("parallax", "derotated_parallax", "focus_distance")], -1
+                [table["parallax_px"][at], table["derotated_parallax_px"][at], _near(table["focus_distance_px"][at])],
+                -1,
             ),
         }
     return {name: np.where(np.isfinite(values), values, np.nan) for name, values in found.items()}
+
+
+def _near(focus_distance_px: Floats) -> Floats:
+    """Distances from the focus of expansion as far as they matter; in a turn it lies anywhere, and hides the rest."""
+    return np.where(focus_distance_px < FARTHEST_FOCUS_PX, focus_distance_px, np.nan)
 
 
 # -------------------------------------------------------------------------------------- tables
