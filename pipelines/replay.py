@@ -3,9 +3,10 @@
 The recording is read and the estimator runs in the caller's thread; images are decoded ahead in one other
 thread, in order, at most `decode_ahead` of them, so that memory is bounded and nothing depends on timing.
 
-Frames are numbered 0, 1, … within the image stream of the whole recording, undecodable ones included. With
-a window, the frames before it are counted by `Recording.count_before` without decoding them, so that a
-frame has the same number in every replay of its recording.
+Frames are images, pixel tracks or measured landmarks: the samples of one stream. They are numbered 0, 1, …
+within that stream of the whole recording, undecodable ones included. With a window, the frames before it are
+counted by `Recording.count_before` without decoding them, so that a frame has the same number in every replay
+of its recording.
 """
 
 from __future__ import annotations
@@ -22,7 +23,19 @@ from typing import Any
 import numpy as np
 
 from pipelines.estimator import Estimator, Step
-from readers.streams import ImageError, ImageSample, Problem, Recording, Sample, StreamKind
+from readers.streams import (
+    ImageError,
+    ImageSample,
+    LandmarkSample,
+    Problem,
+    Recording,
+    Sample,
+    StreamKind,
+    TrackSample,
+)
+
+Frame = ImageSample | TrackSample | LandmarkSample | Problem
+"""What can stand in a stream of frames; all have a number `frame`."""
 
 OnProgress = Callable[[int, int], None]
 
@@ -31,12 +44,14 @@ OnProgress = Callable[[int, int], None]
 class Replayed:
     """One frame of a replay.
 
-    `sample` is the image as it was stored, or the `Problem` that stands for an image that could not be
-    decoded; both carry the frame's number. `step` is what the estimator made of it.
+    `sample` is the frame as it was stored, or the `Problem` that stands for one that could not be decoded; it
+    carries the frame's number. `step` is what the estimator made of it. `shown` is the last image of the stream
+    that is only shown, of those since the frame before; None where there is none.
     """
 
-    sample: ImageSample | Problem
+    sample: Frame
     step: Step
+    shown: ImageSample | Problem | None = None
 
 
 def replay(
@@ -45,24 +60,26 @@ def replay(
     *,
     image_stream: str,
     other_streams: Sequence[str] = (),
+    shown_stream: str = "",
     start_ns: int | None = None,
     stop_ns: int | None = None,
     stride: int = 1,
     decode_ahead: int = 4,
     on_progress: OnProgress | None = None,
 ) -> Generator[Replayed]:
-    """Run an estimator over a recording, as fast as it goes; yield every step with its image.
+    """Run an estimator over a recording, as fast as it goes; yield every step with its frame.
 
     The estimator gets each image as an `ImageSample` with the encoding ``mono8`` (``mono16`` for 16-bit
     images) whose payload is the decoded grey image, an image that cannot be decoded as a `Problem` of kind
-    IMAGE, and the samples of `other_streams` as they are, all in the order of time. Closing the iterator
-    stops the decoding thread at once.
+    IMAGE, and other frames and the samples of `other_streams` as they are, all in the order of time. Closing
+    the iterator stops the decoding thread at once.
 
     Args:
         recording: where the samples come from.
         estimator: takes every sample; makes a Step of every frame that it is to be judged by.
-        image_stream: name of the stream of frames.
+        image_stream: name of the stream of frames: images, pixel tracks or measured landmarks.
         other_streams: names of further streams that the estimator uses.
+        shown_stream: name of a stream of images that come with the steps and that the estimator does not get.
         start_ns: first sensor time of the window (included), None for the start of the recording.
         stop_ns: last sensor time of the window (excluded), None for its end.
         stride: use every n-th frame of the window; the others are not decoded.
@@ -76,37 +93,71 @@ def replay(
     """
     if stride < 1 or decode_ahead < 1:
         raise ValueError(f"stride and decode_ahead must be 1 or more, not {stride} and {decode_ahead}")
-    for name in (image_stream, *other_streams):
+    shown = [shown_stream] if shown_stream and shown_stream != image_stream else []
+    names = [image_stream, *other_streams, *shown]
+    for name in names:
         recording.stream(name)
     first = 0 if start_ns is None else recording.count_before(image_stream, start_ns)
-    samples = recording.read([image_stream, *other_streams], start_ns, stop_ns)
-    chosen = _numbered(samples, image_stream, first, stride)
-    return _steps(_decoded_ahead(chosen, decode_ahead), estimator, image_stream, on_progress)
+    chosen = _numbered(recording.read(names, start_ns, stop_ns), image_stream, first, stride)
+    steps = _steps(_decoded_ahead(chosen, decode_ahead, shown), estimator, image_stream, shown)
+    return _told(_with_shown(steps) if shown else steps, on_progress)
 
 
 def _steps(
-    samples: Generator[tuple[Sample, Sample]],
-    estimator: Estimator[Any],
-    image_stream: str,
-    on_progress: OnProgress | None,
-) -> Generator[Replayed]:
-    """Give every decoded sample to the estimator; yield the frames' steps."""
+    samples: Generator[tuple[Sample, Sample]], estimator: Estimator[Any], frames: str, shown: Sequence[str]
+) -> Generator[Replayed | ImageSample | Problem]:
+    """Give every decoded sample to the estimator; yield the frames' steps, and the images that are only shown."""
     state = estimator.start()
-    done = 0
     with contextlib.closing(samples):
         for original, decoded in samples:
+            if original.stream in shown:
+                if isinstance(original, ImageSample | Problem):
+                    yield original
+                continue
             try:
                 state, step = estimator.step(state, decoded)
             except Exception as error:
                 error.add_note(_where(decoded))
                 raise
-            shown = decoded if isinstance(decoded, Problem) else original
-            if step is None or shown.stream != image_stream or not isinstance(shown, ImageSample | Problem):
-                continue
-            done += 1
-            if on_progress is not None:
-                on_progress(done, shown.t_ns)
-            yield Replayed(shown, step)
+            frame = decoded if isinstance(decoded, Problem) else original
+            if step is not None and frame.stream == frames and isinstance(frame, Frame):
+                yield Replayed(frame, step)
+
+
+def _with_shown(steps: Generator[Replayed | ImageSample | Problem]) -> Generator[Replayed]:
+    """Give each step the last image up to its time; one of the very same time may come after it."""
+    image: ImageSample | Problem | None = None
+    held: Replayed | None = None
+    failed: Exception | None = None
+    with contextlib.closing(steps):
+        while True:
+            try:
+                item = next(steps, None)
+            except Exception as error:
+                item, failed = None, error
+            if held is not None and (item is None or isinstance(item, Replayed) or item.t_ns > held.sample.t_ns):
+                yield dataclasses.replace(held, shown=image)
+                held, image = None, None
+            if item is None:
+                break
+            if isinstance(item, Replayed):
+                held = item
+            else:
+                image = item
+    if failed is not None:
+        raise failed
+
+
+def _told(steps: Generator[Replayed | ImageSample | Problem], on_progress: OnProgress | None) -> Generator[Replayed]:
+    """The steps, each told to `on_progress` before it is given out."""
+    done = 0
+    with contextlib.closing(steps):
+        for item in steps:
+            if isinstance(item, Replayed):
+                done += 1
+                if on_progress is not None:
+                    on_progress(done, item.sample.t_ns)
+                yield item
 
 
 def grey_sample(sample: ImageSample) -> Sample:
@@ -138,7 +189,7 @@ def _numbered(samples: Iterator[Sample], image_stream: str, first: int, stride: 
     """Number the frames, drop those that the stride leaves out, pass the other streams on."""
     frame = first
     for sample in samples:
-        if sample.stream != image_stream or not isinstance(sample, ImageSample | Problem):
+        if sample.stream != image_stream or not isinstance(sample, Frame):
             yield sample
             continue
         if (frame - first) % stride == 0:
@@ -146,18 +197,23 @@ def _numbered(samples: Iterator[Sample], image_stream: str, first: int, stride: 
         frame += 1
 
 
-def _decoded_ahead(samples: Iterator[Sample], ahead: int) -> Generator[tuple[Sample, Sample]]:
-    """Yield every sample with its decoded form, in order, with at most `ahead` images under way."""
+def _decoded_ahead(
+    samples: Iterator[Sample], ahead: int, shown: Sequence[str] = ()
+) -> Generator[tuple[Sample, Sample]]:
+    """Yield every sample with its decoded form, in order, with at most `ahead` images under way.
+
+    Images that are only shown stay as they are.
+    """
     waiting: deque[tuple[Sample, Future[Sample]]] = deque()
     images = 0
     pool = ThreadPoolExecutor(1, thread_name_prefix="decode")
     try:
-        for sample, future in _submitted(samples, pool):
+        for sample, future in _submitted(samples, pool, shown):
             waiting.append((sample, future))
-            images += isinstance(sample, ImageSample)
-            while waiting and (images > ahead or not isinstance(waiting[0][0], ImageSample)):
+            images += _decodes(sample, shown)
+            while waiting and (images > ahead or not _decodes(waiting[0][0], shown)):
                 sample, future = waiting.popleft()
-                images -= isinstance(sample, ImageSample)
+                images -= _decodes(sample, shown)
                 yield sample, future.result()
         while waiting:
             sample, future = waiting.popleft()
@@ -166,7 +222,14 @@ def _decoded_ahead(samples: Iterator[Sample], ahead: int) -> Generator[tuple[Sam
         pool.shutdown(cancel_futures=True)
 
 
-def _submitted(samples: Iterator[Sample], pool: ThreadPoolExecutor) -> Iterator[tuple[Sample, Future[Sample]]]:
+def _decodes(sample: Sample, shown: Sequence[str]) -> bool:
+    """Whether a sample is an image that the estimator gets."""
+    return isinstance(sample, ImageSample) and sample.stream not in shown
+
+
+def _submitted(
+    samples: Iterator[Sample], pool: ThreadPoolExecutor, shown: Sequence[str]
+) -> Iterator[tuple[Sample, Future[Sample]]]:
     """Pair every sample with the future of its decoded form.
 
     An error of the reader is held back until the samples before it are through: it is the result of
@@ -175,7 +238,10 @@ def _submitted(samples: Iterator[Sample], pool: ThreadPoolExecutor) -> Iterator[
     last = Sample(stream="", t_ns=0, received_ns=0)
     try:
         for last in samples:
-            yield last, pool.submit(grey_sample, last) if isinstance(last, ImageSample) else _settled(last)
+            if isinstance(last, ImageSample) and _decodes(last, shown):
+                yield last, pool.submit(grey_sample, last)
+            else:
+                yield last, _settled(last)
     except Exception as error:
         error.add_note(f"after {_where(last)[3:]}" if last.stream else "before the first sample")
         yield last, _settled(error)

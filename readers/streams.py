@@ -209,10 +209,14 @@ class GnssSample(Sample):
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class TrackSample(Sample):
-    """Pixel tracks of one frame: `ids` int64 [N], `points_px` float64 [N, 2] (u, v)."""
+    """Pixel tracks of one frame: `ids` int64 [N], `points_px` float64 [N, 2] (u, v).
+
+    `frame` is the number of the sample in its stream, which the replay sets; -1 before.
+    """
 
     ids: NDArray[np.int64]
     points_px: FloatArray
+    frame: int = -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -221,11 +225,13 @@ class LandmarkSample(Sample):
 
     `ids` int64 [N]; `range_m` [N] distance in the plane; `bearing_rad` [N] direction from the body's x axis,
     counter-clockwise; NaN where not measured. `Recording.landmarks` has the places of those that stand still.
+    `frame` is the number of the sample in its stream, which the replay sets; -1 before.
     """
 
     ids: NDArray[np.int64]
     range_m: FloatArray
     bearing_rad: FloatArray
+    frame: int = -1
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)

@@ -9,8 +9,18 @@ import pytest
 
 from pipelines.replay import Replayed, grey_sample, replay
 from pipelines.verdict import Verdict
-from readers.streams import ImageSample, Problem, RangeSample, RecordingError, Sample, StreamError, StreamKind
-from tests.toys import SIZE, ToyEstimator, ToyImage, ToyRecording, image
+from readers.streams import (
+    ImageSample,
+    LandmarkSample,
+    Problem,
+    RangeSample,
+    RecordingError,
+    Sample,
+    StreamError,
+    StreamKind,
+    TrackSample,
+)
+from tests.toys import SIZE, ToyEstimator, ToyImage, ToyRecording, ToyStep, image
 
 
 def twenty() -> ToyRecording:
@@ -157,3 +167,80 @@ def test_bad_calls_are_refused_at_once() -> None:
         replay(twenty(), ToyEstimator(), image_stream="/camera", stride=0)
     with pytest.raises(StreamError, match="/front"):
         replay(twenty(), ToyEstimator(), image_stream="/front")
+
+
+# ------------------------------------------------------------------- frames that are no images
+
+
+def track(t_ns: int, stream: str = "/tracks") -> TrackSample:
+    return TrackSample(stream=stream, t_ns=t_ns, received_ns=t_ns, ids=np.array([1]), points_px=np.array([[t_ns, 2.0]]))
+
+
+class Counting(ToyEstimator):
+    """Makes a step of everything that has a frame's number."""
+
+    def step(self, state: int, sample: Sample, /) -> tuple[int, ToyStep | None]:
+        self.seen(sample)
+        number = getattr(sample, "frame", -1)
+        if number < 0:
+            return state, None
+        step = ToyStep(
+            frame=number,
+            t_ns=sample.t_ns,
+            received_ns=sample.received_ns,
+            verdict=Verdict.OK,
+            alarms=Verdict.OK,
+            mean=0.0,
+            steps_before=state,
+        )
+        return state + 1, step
+
+
+TRACKS = {"/tracks": StreamKind.TRACK, "/camera": StreamKind.IMAGE}
+
+
+def test_tracks_and_landmarks_are_frames_with_numbers() -> None:
+    seen = LandmarkSample(
+        stream="/tracks",
+        t_ns=30,
+        received_ns=0,
+        ids=np.array([4]),
+        range_m=np.array([1.0]),
+        bearing_rad=np.array([0.0]),
+    )
+    recording = ToyRecording([track(0), track(10), track(20), seen], TRACKS)
+    out = list(replay(recording, Counting(), image_stream="/tracks", start_ns=10))
+    assert frames(out) == [1, 2, 3]
+    assert [getattr(one.sample, "frame", -1) for one in out] == [1, 2, 3]
+    assert isinstance(out[0].sample, TrackSample)
+    assert isinstance(out[2].sample, LandmarkSample)
+    assert all(one.shown is None for one in out)
+
+
+def test_shown_images_come_with_the_steps_and_not_to_the_estimator() -> None:
+    given: list[Sample] = []
+    # one image of the same stamp after its frame, two between frames, one that is damaged, none for the last frame
+    samples: list[Sample] = [track(0), image(0, 7), image(3, 8), image(9, 9), track(10), image(20, damaged=True),
+                             track(20), track(30)]  # fmt: skip
+    out = list(
+        replay(
+            ToyRecording(samples, TRACKS),
+            Counting(seen=given.append),
+            image_stream="/tracks",
+            shown_stream="/camera",
+            stride=1,
+        )
+    )
+    assert [None if one.shown is None else one.shown.t_ns for one in out] == [0, 9, 20, None]
+    assert {type(sample) for sample in given} == {TrackSample}
+    assert frames(out) == [0, 1, 2, 3]
+
+
+def test_an_error_of_the_reader_does_not_swallow_the_step_that_waits_for_its_image() -> None:
+    error = RecordingError("toy", "the file ends", "record again")
+    recording = ToyRecording([track(10 * n) for n in range(4)], TRACKS, fail_at=3, error=error)
+    got: list[int] = []
+    with pytest.raises(RecordingError):
+        got.extend(r.step.frame for r in replay(recording, Counting(), image_stream="/tracks", shown_stream="/camera"))
+    assert got == [0, 1, 2]
+    assert decoders() == 0

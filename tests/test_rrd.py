@@ -9,11 +9,12 @@ import subprocess
 import sys
 import textwrap
 import time
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
 import cv2
+import fake_ranges
 import fake_steps
 import numpy as np
 import pytest
@@ -22,6 +23,7 @@ from rerun.chunk import RrdReader
 import readers
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
+from pipelines.ranging.step import RangeStep
 from pipelines.verdict import Severity, Verdict
 from readers.streams import ImageSample, RecordingError, WorkbenchError
 from workbench import rrd, traces
@@ -38,13 +40,15 @@ def write_run(path: Path, steps: Iterable[Step], **more: Any) -> Path:
     return path
 
 
-def run_writer(path: Path, *, run: str = "best", settings_text: str = "a = 1\n") -> rrd.RunWriter:
+def run_writer(
+    path: Path, *, run: str = "best", settings_text: str = "a = 1\n", step_type: type[Step] = CorrelationStep
+) -> rrd.RunWriter:
     return rrd.RunWriter(
         path,
         recording_id="mission",
         run=run,
         estimator="correlation",
-        step_type=CorrelationStep,
+        step_type=step_type,
         settings_text=settings_text,
     )
 
@@ -449,6 +453,12 @@ def test_a_second_close_does_nothing(tmp_path: Path) -> None:
     assert len(rrd.read_steps(tmp_path / "run.rrd", "best", CorrelationStep)) == 3
 
 
+RUNS: dict[type[Step], tuple[Callable[[int], Iterable[Step]], set[str]]] = {
+    CorrelationStep: (fake_steps.steps, {"Correlation surfaces", "Second / first"}),
+    RangeStep: (fake_ranges.steps, {"Ranges Z, m", "Ranges: 0.5 m red to 50 m blue"}),
+}
+
+
 @pytest.mark.parametrize("step_type", SCHEMAS)
 def test_both_files_can_bring_the_same_view(tmp_path: Path, step_type: type[Step]) -> None:
     view = functools.partial(blueprint_of, step_type, "best", "correlation")
@@ -457,9 +467,12 @@ def test_both_files_can_bring_the_same_view(tmp_path: Path, step_type: type[Step
         with rrd.SensorWriter(tmp_path / f"{name}.rrd", recording_id="mission", **given) as writer:
             writer.reference(fake_steps.reference(20))
         shown.append(view_names(tmp_path / f"{name}.rrd"))
-    write_run(tmp_path / "best.rrd", fake_steps.steps(3))
-    assert shown[1] == view_names(tmp_path / "best.rrd") > shown[0] - {"Image"}
-    assert {"Verdicts", "Correlation surfaces", "Events", "Second / first"} <= shown[1]
+    steps, own = RUNS[step_type]
+    write_run(tmp_path / "best.rrd", steps(3), step_type=step_type)
+    run = view_names(tmp_path / "best.rrd")
+    assert shown[1] <= run
+    assert shown[1] > shown[0] - {"Image", "Map: reference green, raw grey, corrected blue, aligned violet"}
+    assert {"Verdicts", "Events", "Recording", *own} <= shown[1]
 
 
 def view_names(path: Path) -> set[str]:

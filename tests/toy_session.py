@@ -152,7 +152,7 @@ class ToySensors(TextLog):
 
 
 class ToyRun(TextLog):
-    def step(self, step: Step) -> None:
+    def step(self, step: Step, beside: Any = None) -> None:
         self._say("step", step.frame, step.t_ns, step.verdict.name)
 
     def event(self, frame: int, t_ns: int, severity: Severity, text: str) -> None:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+import colorsys
 import math
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -14,6 +15,7 @@ from numpy.typing import NDArray
 
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
+from pipelines.ranging.step import RangeStep
 
 FIELD_OF_VIEW = math.radians(55)
 """Of the viewer's eye, from top to bottom."""
@@ -74,12 +76,14 @@ class Bounds:
         extent: the square on the ground, for the map.
         image_px: width and height of the image.
         surfaces_px: width and height of the mosaic of correlation surfaces.
+        landmarks: of the range filter: slot, name, and upper end of the plot of ranges in m (0: the viewer's choice).
     """
 
     frames: tuple[int, int] | None = None
     extent: Extent | None = None
     image_px: tuple[float, float] | None = None
     surfaces_px: tuple[float, float] | None = None
+    landmarks: tuple[tuple[int, str, float], ...] = ()
 
 
 def sensor_blueprint(bounds: Bounds) -> rrb.Blueprint:
@@ -102,6 +106,8 @@ def blueprint_of(step_type: type[Step], run: str, estimator: str, bounds: Bounds
     """The view of a run of the estimator that makes these steps; plain where there is none of its own."""
     if issubclass(step_type, CorrelationStep):
         return correlation_blueprint(run, estimator, bounds)
+    if issubclass(step_type, RangeStep):
+        return range_blueprint(run, estimator, bounds)
     return rrb.Blueprint(*_panels(), auto_views=True, auto_layout=True)
 
 
@@ -125,6 +131,113 @@ def correlation_blueprint(run: str, estimator: str = "correlation", bounds: Boun
         *_panels(),
         auto_views=False,
     )  # fmt: skip
+
+
+def range_blueprint(run: str, estimator: str = "range", bounds: Bounds | None = None) -> rrb.Blueprint:
+    """Image and map at the left, plots of all landmarks or of one at the right; verdicts and texts at the foot."""
+    bounds = bounds or Bounds()
+    root, image = f"/runs/{run}/{estimator}", f"/camera/image/{run}"
+    drawn = ["/camera/image", *(f"{image}/{name}" for name in _ON_IMAGE)]
+    ranged = ["/camera/image", f"{image}/frame", f"{image}/ranges"]
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(
+                rrb.Vertical(
+                    rrb.Tabs(
+                        _image("/camera/image", bounds.image_px, "Image: measured, predicted (white), gate, focus",
+                               contents=drawn),
+                        _image("/camera/image", bounds.image_px, "Ranges: 0.5 m red to 50 m blue", contents=ranged),
+                    ),
+                    _map(run, bounds.extent, "Map: camera blue, surveyed white, landmarks by status", ()),
+                ),
+                _landmark_plots(root, bounds),
+                column_shares=[2, 3],
+            ),
+            rrb.Horizontal(
+                rrb.StateTimelineView(origin=root, contents=[f"{root}/verdict", f"{root}/verdicts/**"],
+                                      name="Verdicts", time_view=_axis(bounds.frames)),
+                _texts(run, root, rrb.TextDocumentView(origin=f"{root}/slots", name="Slots")),
+                column_shares=[2, 3],
+            ),
+            row_shares=[18, 7],
+        ),
+        *_panels(),
+        auto_views=False,
+    )  # fmt: skip
+
+
+_ON_IMAGE = ("frame", "measured", "predicted", "innovation", "gate", "labels", "focus")
+_ONE = (  # of one landmark: entity, name
+    ("range", "Range Z with ξ ± 2σ, reference green, m"),
+    ("nis", "NIS; 5.99 and 13.8 of χ²"),
+    ("xi", "Inverse depth ξ ± 2σ, 1/m"),
+    ("innovation", "Innovation ν (x blue, y orange) ± 2 √S, px"),
+    ("relative_sigma", "σ_ξ/ξ"),
+    ("sigma", "σ of x (blue) and y, px"),
+    ("parallax", "Parallax: derotated blue, raw grey; to the focus orange, px"),
+    ("gain", "Gain K (xx blue, yy orange, ξx green, ξy red)"),
+)
+
+
+def _landmark_plots(root: str, bounds: Bounds) -> rrb.Tabs:
+    """A tab for all landmarks, and one for each."""
+
+    def plot(
+        name: str, contents: Sequence[str], *, top: float = 0.0, overrides: Mapping[Any, Any] | None = None
+    ) -> rrb.TimeSeriesView:
+        return rrb.TimeSeriesView(
+            origin=root,
+            contents=list(contents),
+            name=name,
+            axis_x=_axis(bounds.frames),
+            axis_y=rrb.ScalarAxis(range=(0.0, top), zoom_lock=False) if top > 0 else None,
+            overrides=dict(overrides or {}),
+            plot_legend=rrb.PlotLegend(visible=False),
+        )
+
+    def every(title: str, entity: str, *more: str, top: float = 0.0, show: Sequence[bool] = (True,)) -> Any:
+        """One series of each landmark, in the landmark's colour."""
+        entities = {f"{root}/landmark/{slot}/{entity}": _slot_colour(slot) for slot, _, _ in bounds.landmarks}
+        looks = {
+            path: rr.SeriesLines.from_fields(visible_series=list(show), colors=np.full(len(show), colour, np.uint32))
+            for path, colour in entities.items()
+        }
+        return plot(title, [*entities, *more], top=top, overrides=looks)
+
+    chi2 = f"{root}/bounds/nis"
+    highest = max((top for _, _, top in bounds.landmarks), default=0.0)
+    all_of_them = rrb.Grid(
+        every("Ranges Z, m", "range", top=highest, show=[True, False, False, False]),
+        every("NIS; 5.99 and 13.8 of χ²", "nis", chi2, top=4 * 5.99),
+        every("σ_ξ/ξ", "relative_sigma", top=0.5),
+        every("Derotated parallax, px", "parallax", show=[False, True, False]),
+        plot("Landmarks: carried, measured, converged", [f"{root}/count"]),
+        plot("ω, rad/s, and V, m/s", [f"{root}/inputs/omega", f"{root}/inputs/speed"]),
+        grid_columns=2,
+        name="All",
+    )
+    tabs = [
+        rrb.Grid(
+            *(
+                plot(
+                    title,
+                    [f"{root}/landmark/{slot}/{entity}", *([chi2] if entity == "nis" else [])],
+                    top={"range": top, "nis": 4 * 5.99, "relative_sigma": 0.5}.get(entity, 0.0),
+                )
+                for entity, title in _ONE
+            ),
+            grid_columns=2,
+            name=name,
+        )
+        for slot, name, top in bounds.landmarks
+    ]
+    return rrb.Tabs(all_of_them, *tabs, active_tab=1 if tabs else 0)
+
+
+def _slot_colour(slot: int) -> int:
+    """RGBA of a landmark's slot, hues by the golden section."""
+    rgb = colorsys.hsv_to_rgb((0.57 + slot * 0.618) % 1, 0.6, 0.95)
+    return sum(int(c * 255) << shift for c, shift in zip(rgb, (24, 16, 8), strict=True)) | 0xFF
 
 
 def _panels() -> Sequence[Any]:
@@ -161,8 +274,13 @@ def _absolute(frame: int) -> rr.TimeRangeBoundary:
     return rr.TimeRangeBoundary.absolute(seq=frame)
 
 
-def _map(run: str, extent: Extent | None) -> rrb.Spatial3DView:
-    """The ground from above, x to the right, y up; the path of a run up to the cursor, where one is named."""
+def _map(
+    run: str,
+    extent: Extent | None,
+    name: str = "Map: reference green, raw grey, corrected blue, aligned violet",
+    trails: Sequence[str] = ("raw", "corrected"),
+) -> rrb.Spatial3DView:
+    """The ground from above, x to the right, y up; the trails of a run up to the cursor, where one is named."""
     eye = None
     if extent is not None:
         eye = rrb.EyeControls3D(
@@ -176,11 +294,11 @@ def _map(run: str, extent: Extent | None) -> rrb.Spatial3DView:
             for name in ("frame", "sensor_time")
         ]
     )
-    overrides: dict[Any, Any] = {f"/world/runs/{run}/{name}": trail for name in ("raw", "corrected") if run}
+    overrides: dict[Any, Any] = {f"/world/runs/{run}/{trailed}": trail for trailed in trails if run}
     return rrb.Spatial3DView(
         origin="/world",
         contents="/world/**",
-        name="Map: reference green, raw grey, corrected blue, aligned violet",
+        name=name,
         eye_controls=eye,
         overrides=overrides,
         background=[18, 20, 24],
@@ -248,7 +366,7 @@ def _plots(root: str, frames: tuple[int, int] | None) -> rrb.Tabs:
     )
 
 
-def _texts(run: str, root: str) -> rrb.Tabs:
+def _texts(run: str, root: str, *more: rrb.TextDocumentView) -> rrb.Tabs:
     columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
     return rrb.Tabs(
         rrb.TextDocumentView(origin=f"{root}/numbers", name="Numbers"),
@@ -257,5 +375,6 @@ def _texts(run: str, root: str) -> rrb.Tabs:
         rrb.TextDocumentView(origin=f"/runs/{run}/summary", name="Summary"),
         rrb.TextDocumentView(origin=f"/runs/{run}/settings", name="Settings"),
         rrb.TextDocumentView(origin="/recording/facts", name="Recording"),
+        *more,
         active_tab=1,
     )

@@ -234,6 +234,8 @@ def _camera_text(camera: Camera) -> str:
         "workbench replay mission.bag --set metres_per_px=0.00078",
         "workbench replay mission.bag --height /lidar/range --reference /mocap/pose",
         "workbench replay frames/ --rate 60 --times times.txt --json",
+        "workbench replay mission.bag -e range --odometry /wheel/odometry --imu /imu",
+        "workbench replay sim:paper-b -e range --set landmarks=corners",
     ),
 )
 def replay(
@@ -256,6 +258,15 @@ def replay(
     ] = None,
     name: Annotated[str | None, typer.Option(help="Name of the run [the preset's].")] = None,
     image: Annotated[str | None, typer.Option(metavar="TOPIC", help="Image stream [the only one].")] = None,
+    tracks: Annotated[
+        str | None, typer.Option(metavar="TOPIC", help="Range: pixel tracks or measured landmarks [the only ones].")
+    ] = None,
+    odometry: Annotated[
+        str | None, typer.Option(metavar="TOPIC", help="Range: odometry with the speed [the only one].")
+    ] = None,
+    imu: Annotated[
+        str | None, typer.Option(metavar="TOPIC", help="Range: IMU with the rate of turn, or none [the only one].")
+    ] = None,
     reference: Annotated[
         str | None,
         typer.Option(metavar="TOPIC", help="Pose, GNSS or odometry stream to compare with, or none [the only one]."),
@@ -278,8 +289,10 @@ def replay(
 ) -> None:
     """Replay a recording through an estimator; write all it computed, and a summary.
 
-    The folder of the results then holds sensors.rrd, RUN.rrd, RUN.toml (settings, versions, summary) and RUN.tum
-    (trajectory). Ctrl-C ends the replay early and loses nothing.
+    The folder of the results then holds sensors.rrd, RUN.rrd, RUN.toml (settings, versions, summary) and, of an
+    estimator of the vehicle's path, RUN.tum (trajectory). With -e range the frames are pixel tracks, measured landmarks
+    or images, and the summary tells the ranges' errors where there is a reference. Ctrl-C ends the replay early and
+    loses nothing.
     """
     from workbench.session import Request
 
@@ -295,6 +308,9 @@ def replay(
         out=out,
         name=name,
         image=image,
+        tracks=tracks,
+        odometry=odometry,
+        imu=imu,
         reference=reference,
         reference_offset_s=reference_offset,
         height=height,
@@ -338,7 +354,9 @@ def _status(outcome: Outcome) -> int:
 
 def _files(outcome: Outcome) -> list[str]:
     run = outcome.run_file
-    return [str(f) for f in (outcome.sensors_file, run, run.with_suffix(".toml"), run.with_suffix(".tum"))]
+    trajectory = run.with_suffix(".tum")
+    files = [outcome.sensors_file, run, run.with_suffix(".toml"), *([trajectory] if trajectory.exists() else [])]
+    return [str(file) for file in files]
 
 
 def _print_summary(outcome: Outcome) -> None:

@@ -115,9 +115,24 @@ def first_frame(recording: Recording, stream: str, start_ns: int | None, stop_ns
             break
     if tries:
         raise StreamError(f"{recording.path}: none of the first {tries} images of {stream} can be decoded: {reason}")
+    raise _no_frame(recording, stream)
+
+
+def first_time(recording: Recording, stream: str, start_ns: int | None, stop_ns: int | None) -> int:
+    """Time of the first frame of a window, decodable or not.
+
+    Raises:
+        StreamError: the window has none.
+    """
+    for sample in recording.read([stream], start_ns, stop_ns):
+        return sample.t_ns
+    raise _no_frame(recording, stream)
+
+
+def _no_frame(recording: Recording, stream: str) -> StreamError:
     info = recording.stream(stream)
     span = f"from {info.first_ns} to {info.last_ns} ns" if info.first_ns >= 0 else "at no time"
-    raise StreamError(f"{recording.path}: {stream} has no frame in this window; its messages lie {span}")
+    return StreamError(f"{recording.path}: {stream} has no frame in this window; its messages lie {span}")
 
 
 # -------------------------------------------------------------------------------- streams
@@ -135,13 +150,13 @@ def choose_images(recording: Recording, wanted: str | None) -> str:
         StreamError: it is missing or holds no images, or there are several or none to choose from.
     """
     if wanted is not None:
-        return _of_kind(recording, wanted, (StreamKind.IMAGE,), "--image")
+        return of_kind(recording, wanted, (StreamKind.IMAGE,), "--image")
     found = recording.of_kind(StreamKind.IMAGE)
     if len(found) == 1:
         return found[0].name
     if found:
         raise StreamError(f"{recording.path}: several image streams: {names(found)}; choose one with --image")
-    raise StreamError(f"{recording.path}: no stream of images that can be read; the streams are: {_kinds(recording)}")
+    raise StreamError(f"{recording.path}: no stream of images that can be read; the streams are: {kinds(recording)}")
 
 
 def choose_height(recording: Recording, wanted: str | None) -> str:
@@ -152,12 +167,17 @@ def choose_height(recording: Recording, wanted: str | None) -> str:
     """
     kinds = (StreamKind.RANGE, StreamKind.SCALAR, StreamKind.POSE)
     if wanted is not None:
-        return "" if wanted == NONE else _of_kind(recording, wanted, kinds, "--height")
+        return "" if wanted == NONE else of_kind(recording, wanted, kinds, "--height")
     found = recording.of_kind(StreamKind.RANGE)
     return found[0].name if len(found) == 1 else ""
 
 
-def _of_kind(recording: Recording, wanted: str, kinds: Sequence[StreamKind], option: str) -> str:
+def of_kind(recording: Recording, wanted: str, kinds: Sequence[StreamKind], option: str) -> str:
+    """The name of a stream that was asked for.
+
+    Raises:
+        StreamError: it is missing, cannot be read, or holds something else.
+    """
     info = recording.stream(wanted)
     if not info.readable:
         raise StreamError(f"{recording.path}: {wanted} cannot be read: {info.reason}")
@@ -167,7 +187,8 @@ def _of_kind(recording: Recording, wanted: str, kinds: Sequence[StreamKind], opt
     return info.name
 
 
-def _kinds(recording: Recording) -> str:
+def kinds(recording: Recording) -> str:
+    """The names and kinds of all streams, for a message."""
     return ", ".join(f"{s.name} ({s.kind})" for s in recording.streams) or "none"
 
 
@@ -200,7 +221,7 @@ def choose_reference(recording: Recording, wanted: str | None) -> tuple[str, str
     if wanted == NONE:
         return "", "none, as asked"
     if wanted is not None:
-        return _of_kind(recording, wanted, kinds, "--reference"), f"{wanted}, as asked"
+        return of_kind(recording, wanted, kinds, "--reference"), f"{wanted}, as asked"
     for kind in kinds:
         found = recording.of_kind(kind)
         if len(found) > 1:
@@ -230,7 +251,7 @@ def load_reference(
         return Reference(stream, sentence)
     lower = None if start_ns is None else start_ns + offset_ns - MARGIN_NS
     upper = None if stop_ns is None else stop_ns + offset_ns + MARGIN_NS
-    poses = reference_poses(_while_readable(recording.read([stream], lower, upper)))
+    poses = reference_poses(while_readable(recording.read([stream], lower, upper)))
     if poses:
         return Reference(stream, sentence, poses)
     return _no_reference(recording, f"{stream} holds no position in this window", wanted)
@@ -265,7 +286,7 @@ def _no_reference(recording: Recording, problem: str, wanted: str | None) -> Ref
     return Reference("", f"none: {problem}")
 
 
-def _while_readable(samples: Iterator[Sample]) -> Iterator[Sample]:
+def while_readable(samples: Iterator[Sample]) -> Iterator[Sample]:
     """Samples up to where the file can be read; that it ends there is for the replay to say, which reads it too."""
     with contextlib.suppress(RecordingError):
         yield from samples

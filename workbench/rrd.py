@@ -1,4 +1,4 @@
-"""Rerun recordings: the only module that writes and reads ``.rrd`` files.
+"""Rerun recordings: the door to writing and reading ``.rrd`` files.
 
 A mission has one file of what was measured (`SensorWriter`) and one per run of what was concluded
 (`RunWriter`); equal recording ids let one viewer show them together. Both write columns, close with a
@@ -30,140 +30,51 @@ import rerun as rr
 from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
+from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
 from pipelines.geometry import heading_of_quat
+from pipelines.ranging.step import RangeStep
 from pipelines.verdict import Severity, Verdict
-from readers.streams import ImageError, ImageSample, PoseSample, RecordingError, WorkbenchError
+from readers.streams import ImageError, ImageSample, PoseSample, RecordingError
 from workbench import traces
 from workbench.blueprints import Bounds, Extent, blueprint_of, sensor_blueprint
+from workbench.rrd_correlation import CorrelationDrawing
+from workbench.rrd_drawing import Drawing
+from workbench.rrd_file import APPLICATION as APPLICATION
+from workbench.rrd_file import (
+    ARROW_SHARE,
+    COLOURS,
+    IMAGE,
+    REFERENCE,
+    RrdFile,
+    arrow,
+    blobs,
+    document,
+    flat,
+    marker,
+    texts,
+)
+from workbench.rrd_ranges import RangeDrawing
 from workbench.schema import Archetype, Row, Schema, schema_of
 
 if TYPE_CHECKING:
     import pandas as pd
 
-APPLICATION = "estimator_workbench"
-IMAGE = "/camera/image"
-REFERENCE = "/world/reference"
-
 MAX_ROWS = 1024
 MAX_BYTES = 2 << 20
 MAX_AGE_S = 0.5
-ARROW_SHARE = 0.1
-"""Length of the arrows of heading, in sides of the map."""
-
-LAYER_M = 0.001
-"""Height of each layer of the map over the one below, so that what lies over one another does not flicker."""
-
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-_LEVELS = {Severity.FINE: "INFO", Severity.NOTICE: "INFO", Severity.WARNING: "WARN", Severity.ERROR: "ERROR"}
-_COLOURS = {"reference": 0x2ECC71FF, "raw": 0x9E9E9EFF, "corrected": 0x4FC3F7FF, "aligned": 0xCE93D8FF,
-            "arrow": 0xFFFFFFFF}  # fmt: skip
-_LAYERS = ("aligned", "reference", "raw", "corrected", "markers", "arrows")
 
-
-# ---------------------------------------------------------------------------- one file
-
-
-class _File:
-    """One ``.rrd`` that is being written: an explicit stream of columns on both timelines."""
-
-    def __init__(self, path: Path, recording_id: str) -> None:
-        self._rec = rr.RecordingStream(APPLICATION, recording_id=recording_id, send_properties=False)
-        if not rr.is_enabled(self._rec):
-            raise WorkbenchError(f"{path}: Rerun is switched off by the environment; unset RERUN or set RERUN=on")
-        try:
-            path.parent.mkdir(parents=True, exist_ok=True)
-            self._rec.save(path)
-        except (OSError, RuntimeError) as error:
-            raise RecordingError(path, f"cannot be written ({error})", "choose another folder with -o") from error
-        self._rec.set_log_time_enabled(False)
-        self._rec.set_log_tick_enabled(False)
-        self.static("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
-
-    def static(self, entity: str, *what: rr.AsComponents) -> None:
-        """Log what holds for the whole recording."""
-        self._rec.log(entity, *what, static=True, strict=True)
-
-    def send(self, entity: str, frames: Ints | None, t_ns: Ints, *columns: Iterable[Any]) -> None:
-        """Log rows of one entity at sensor times [n] and at frames [n], where they belong to frames."""
-        if len(t_ns):
-            times = [rr.TimeColumn("sensor_time", timestamp=np.asarray(t_ns, np.int64).view("datetime64[ns]"))]
-            if frames is not None:
-                times.append(rr.TimeColumn("frame", sequence=frames))
-            self._rec.send_columns(entity, times, [c for group in columns for c in group], strict=True)
-
-    def scale_bar(self, extent: Extent) -> None:
-        """Draw a round length below the map."""
-        length, (x, y) = extent.bar()
-        line = rr.LineStrips3D(
-            [[(x, y, 0.0), (x + length, y, 0.0)]],
-            labels=[f"{length:g} m"], show_labels=True, colors=0xFFFFFFFF, radii=rr.Radius.ui_points(1.5),
-        )  # fmt: skip
-        self.static("/world/scale", line)
-
-    def flush(self) -> None:
-        """Hand everything to the operating system: a process killed after this loses nothing of it."""
-        self._rec.flush()
-
-    def blueprint(self, blueprint: rr.blueprint.Blueprint) -> None:
-        """Make this the view of the file."""
-        self._rec.send_blueprint(blueprint, make_active=True, make_default=True)
-
-    def close(self) -> None:
-        """Write the footer."""
-        self._rec.flush()
-        self._rec.disconnect()
-
-
-def _blobs(items: Sequence[Any]) -> Any:
-    """Buffers of bytes as one Arrow array of blobs, copied once."""
-    parts = [np.frombuffer(item, np.uint8) for item in items]
-    offsets = np.cumsum([0, *map(len, parts)], dtype=np.int32)
-    kind = rr.components.BlobBatch._ARROW_DATATYPE
-    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(np.concatenate(parts)), type=kind)
-
-
-def _repeated(column: rr.ComponentColumnList, count: int) -> rr.ComponentColumnList:
-    """A column of one row, `count` times."""
-    repeated = []
-    for one in column:
-        values = one.component_batch.as_arrow_array().take(pa.array(np.zeros(count, np.int64)))
-        repeated.append(rr.ComponentColumn(one.component_descriptor(), _Arrow(values)))
-    return rr.ComponentColumnList(repeated)
-
-
-class _Arrow:
-    """An Arrow array where Rerun wants a batch."""
-
-    def __init__(self, values: pa.Array) -> None:
-        self._values = values
-
-    def as_arrow_array(self) -> pa.Array:
-        return self._values
-
-
-def _texts(events: Sequence[traces.Event]) -> rr.ComponentColumnList:
-    return rr.TextLog.columns(text=[e.text for e in events], level=[_LEVELS[e.severity] for e in events])
-
-
-def _flat(points: Floats, layer: str = "") -> NDArray[np.float32]:
-    """Points [n, 2] on the ground as [n, 3] in the viewer's precision, a hair above the layers below."""
-    z = LAYER_M * (_LAYERS.index(layer) if layer else 0)
-    with np.errstate(over="ignore"):
-        return np.column_stack([points, np.full(len(points), z)]).astype(np.float32)
-
-
-def _document(text: str) -> rr.TextDocument:
-    return rr.TextDocument(text, media_type="text/markdown")
+_DRAWINGS: Mapping[type[Step], type[Drawing]] = {CorrelationStep: CorrelationDrawing, RangeStep: RangeDrawing}
 
 
 class _Writer(abc.ABC):
     """What both writers share: the file, the age of the buffer, and an orderly end."""
 
     def __init__(self, path: Path | str, recording_id: str) -> None:
-        self._file = _File(Path(path), recording_id)
+        self._file = RrdFile(Path(path), recording_id)
         self._sent = -np.inf
         self._open = True
 
@@ -272,11 +183,11 @@ class SensorWriter(_Writer):
         self._arrow_m = extent.size_m * ARROW_SHARE
         self._file.scale_bar(extent)
         self._file.blueprint(self._view(Bounds(extent=extent)))
-        points = _flat(position[:, :2], "reference")
-        path = rr.LineStrips3D([points], colors=_COLOURS["reference"], radii=rr.Radius.ui_points(2.5))
+        points = flat(position[:, :2], "reference")
+        path = rr.LineStrips3D([points], colors=COLOURS["reference"], radii=rr.Radius.ui_points(2.5))
         self._file.static(f"{REFERENCE}/path", path)
-        self._file.static(f"{REFERENCE}/pose", _marker("reference", 7))
-        self._file.static(f"{REFERENCE}/heading", _arrow("reference", 3))
+        self._file.static(f"{REFERENCE}/pose", marker("reference", 7))
+        self._file.static(f"{REFERENCE}/heading", arrow("reference", 3))
         names = ["x [m]", "y [m]", "z [m]", "heading [rad]"]
         self._file.static("/sensors/reference", rr.SeriesLines(names=names))
         values = rr.Scalars.columns(scalars=np.column_stack([position, heading]))
@@ -284,7 +195,7 @@ class SensorWriter(_Writer):
 
     def facts(self, lines: Iterable[str]) -> None:
         """Log facts of the recording, one Markdown line each."""
-        self._file.static("/recording/facts", _document("\n".join(f"- {line}" for line in lines)))
+        self._file.static("/recording/facts", document("\n".join(f"- {line}" for line in lines)))
 
     def _encoded(self, frame: int, t_ns: int, data: Any, media_type: str) -> None:
         self._images.append((frame, t_ns, data, media_type))
@@ -293,7 +204,7 @@ class SensorWriter(_Writer):
     def _write(self) -> None:
         if self._images:
             frames, t_ns, data, media = zip(*self._images, strict=True)
-            columns = rr.EncodedImage.columns(blob=_blobs(data), media_type=list(media))
+            columns = rr.EncodedImage.columns(blob=blobs(data), media_type=list(media))
             self._file.send(IMAGE, np.array(frames), np.array(t_ns), columns)
         for frame, when, pixels in self._pixels:
             columns = rr.Image.columns(buffer=[pixels.tobytes()], format=[_format(pixels)])
@@ -308,9 +219,9 @@ class SensorWriter(_Writer):
         frames, t_ns = frames[inside], t_ns[inside]
         since, known = (t_ns - at_ns[0]).astype(float), (at_ns - at_ns[0]).astype(float)
         x, y, alpha = (np.interp(since, known, values) for values in (position[:, 0], position[:, 1], heading))
-        points = _flat(np.column_stack([x, y]), "reference")
+        points = flat(np.column_stack([x, y]), "reference")
         self._file.send(f"{REFERENCE}/pose", frames, t_ns, rr.Points3D.columns(positions=points))
-        vectors = _flat(self._arrow_m * np.column_stack([np.cos(alpha), np.sin(alpha)]))
+        vectors = flat(self._arrow_m * np.column_stack([np.cos(alpha), np.sin(alpha)]))
         good = np.isfinite(vectors).all(axis=1)
         arrows = rr.Arrows3D.columns(vectors=vectors[good], origins=points[good])
         self._file.send(f"{REFERENCE}/heading", frames[good], t_ns[good], arrows)
@@ -337,19 +248,11 @@ def _format(pixels: NDArray[Any]) -> rr.components.ImageFormat:
     )
 
 
-def _marker(name: str, radius: float) -> rr.Points3D:
-    return rr.Points3D.from_fields(colors=_COLOURS[name], radii=rr.Radius.ui_points(radius))
-
-
-def _arrow(name: str, radius: float) -> rr.Arrows3D:
-    return rr.Arrows3D.from_fields(colors=_COLOURS[name], radii=rr.Radius.ui_points(radius))
-
-
 # -------------------------------------------------------------------------------- runs
 
 
 class RunWriter(_Writer):
-    """Writes what one run concluded: every field of its steps, overlays, trajectory, verdicts.
+    """Writes what one run concluded: every field of its steps, what is drawn of them, verdicts.
 
     Args:
         path: the file to write.
@@ -359,6 +262,7 @@ class RunWriter(_Writer):
         step_type: class of the steps; it needs a schema.
         settings_text: the settings as they are saved beside the result.
         ground: points [n, 2] in m that the map shows beside the run's own path, such as the reference's.
+        scene: what the drawing of this estimator's steps needs to know beyond them, see its `Drawing`.
 
     Raises:
         WorkbenchError: Rerun is switched off, or the Step class has no schema.
@@ -375,36 +279,39 @@ class RunWriter(_Writer):
         step_type: type[Step],
         settings_text: str,
         ground: Floats | None = None,
+        scene: Any = None,
     ) -> None:
         self._schema = schema_of(step_type)
         self._run, self._estimator = run, estimator
         super().__init__(path, recording_id)
         self._root = f"/runs/{run}/{estimator}"
-        self._world = f"/world/runs/{run}"
         self._steps: list[Step] = []
+        self._beside: list[Any] = []
         self._shape_of = traces.shape_of(self._schema)
         self._shape: Any = None
         self._changes = traces.Changes()
         self._lanes: dict[Verdict, bool] = {}
-        self._path: list[tuple[Ints, Ints, Floats, Floats]] = []
-        self._arrangement: bytes | None = None
+        self._span: tuple[int, int] | None = None
+        drawing = _DRAWINGS.get(step_type, Drawing)
+        self._drawing = drawing(self._file, self._schema, run, estimator, scene)
         self._file.static(f"/runs/{run}/settings", rr.TextDocument(settings_text, media_type="text/plain"))
         self._constants()
         self._bounds = Bounds(extent=None if ground is None else Extent.of(ground))
 
-    def step(self, step: Step) -> None:
-        """Log one step."""
+    def step(self, step: Step, beside: Any = None) -> None:
+        """Log one step, and what is known of its frame from elsewhere, for estimators whose drawing shows that."""
         shape = self._shape_of(step)
         if shape != self._shape:
             self._write()
             self._shape = shape
             self._legends(step)
         self._steps.append(step)
+        self._beside.append(beside)
         self._flush_if(len(self._steps) >= self._capacity)
 
     def event(self, frame: int, t_ns: int, severity: Severity, text: str) -> None:
         """Log something worth stepping to that no verdict says."""
-        columns = _texts([traces.Event(0, severity, text)])
+        columns = texts([traces.Event(0, severity, text)])
         self._file.send(f"{self._root}/events", np.array([frame]), np.array([t_ns]), columns)
 
     def errors(self, frames: Ints, t_ns: Ints, values: Floats) -> None:
@@ -419,14 +326,9 @@ class RunWriter(_Writer):
         """Log what is known at the end: the summary, the whole path, and the path [n, 2] aligned with the reference."""
         self.flush()
         rows = "\n\n".join(f"**{key}** – {_number(value)}" for key, value in summary.items())
-        self._file.static(f"/runs/{self._run}/summary", _document(rows))
-        if aligned_path is not None and len(aligned_path):
-            self._line("aligned", aligned_path)
-        if self._path:
-            frames, t_ns, raw, pose = (np.concatenate(column) for column in zip(*self._path, strict=True))
-            self._finish_path(frames, t_ns, raw, pose)
-        else:
-            self._view()
+        self._file.static(f"/runs/{self._run}/summary", document(rows))
+        known = self._drawing.finish(aligned_path, self._bounds.extent)
+        self._view(**({} if self._span is None else {"frames": self._span}), **known)
 
     # ---- what is logged once
 
@@ -436,73 +338,35 @@ class RunWriter(_Writer):
         colours = [traces.SEVERITY_COLOURS[v.severity] for v in [Verdict.OK, *verdicts]]
         lanes = rr.StateConfiguration(values=names, labels=names, colors=colours)
         self._file.static(f"{self._root}/verdict", lanes)
-        thin, thick = rr.Radius.ui_points(0.75), rr.Radius.ui_points(1.25)
-        image = f"{IMAGE}/{self._run}"
-        self._file.static(f"{image}/fragments", rr.Boxes2D.from_fields(colors=0xFFFFFFB0, radii=thin, draw_order=11))
-        self._file.static(f"{image}/search", rr.Boxes2D.from_fields(colors=0x4FC3F7FF, radii=thin, draw_order=10))
-        self._file.static(f"{image}/matches", rr.Boxes2D.from_fields(radii=thick, draw_order=12))
-        self._file.static(f"{image}/tiles", rr.Points2D.from_fields(radii=rr.Radius.ui_points(2), draw_order=14))
-        self._file.static(f"{image}/shifts", rr.Arrows2D.from_fields(radii=thick, draw_order=13))
-        surface = f"{self._root}/{self._schema.entity('surface')}"
-        self._file.static(
-            surface,
-            rr.DepthImage.from_fields(
-                colormap="viridis", depth_range=(-0.5, 1.0), meter=1.0, magnification_filter="nearest"
-            ),
-        )
-        for name, colour, radius in (("second", 0xFF8A65FF, 3), ("first", 0xFF1744FF, 4)):
-            marks = rr.Points2D.from_fields(colors=colour, radii=rr.Radius.ui_points(radius))
-            self._file.static(f"{surface}/{name}", marks)
-        labels = rr.Points2D.from_fields(colors=0xFFFFFFFF, radii=rr.Radius.ui_points(0), show_labels=True)
-        self._file.static(f"{surface}/labels", labels)
-        for name in ("raw", "corrected"):
-            self._file.static(f"{self._world}/{name}", rr.Points3D.from_fields(radii=rr.Radius.ui_points(2)))
-        self._file.static(f"{self._world}/raw", rr.Points3D.from_fields(colors=_COLOURS["raw"]))
-        self._file.static(f"{self._world}/body", _marker("corrected", 4.5))
-        self._file.static(f"{self._world}/heading", _arrow("arrow", 1.5))
-        self._file.static(
-            f"{self._world}/covariance",
-            rr.Ellipsoids3D.from_fields(
-                colors=_COLOURS["corrected"], line_radii=rr.Radius.ui_points(1), fill_mode="MajorWireframe"
-            ),
-        )
+        self._drawing.constants()
 
     def _legends(self, step: Step) -> None:
-        """Log the names of the series, which depend on the number of fragments."""
+        """Log the names of the series, which depend on the number of fragments or landmarks."""
         table = traces.columns(self._schema, [step])
         for entity, values in traces.scalar_groups(self._schema, table):
             series = self._schema.series(entity, values.shape[1])
             colours = np.array([one.colour for one in series], np.uint32)
             lines = rr.SeriesLines(names=[one.name for one in series], colors=colours)
             self._file.static(f"{self._root}/{entity}", lines)
-        labels = [str(k + 1) for k in range(table["fragment_px"].shape[1])]
-        self._file.static(f"{IMAGE}/{self._run}/fragments", rr.Boxes2D.from_fields(labels=labels))
-        group = next(traces.mosaics(table))
-        height, width = group.images.shape[1:]
-        image_px = tuple(table["image_size_px"][0].tolist())
-        self._view(image_px=image_px, surfaces_px=(float(width), float(height)))
-        bytes_a_step = table["surface"].nbytes + 4096
-        self._capacity = max(1, min(MAX_ROWS, MAX_BYTES // bytes_a_step))
+        self._view(**self._drawing.legends(table))
+        self._capacity = max(1, min(MAX_ROWS, MAX_BYTES // self._drawing.bytes_a_step(table)))
 
     # ---- what is logged with every step
 
     def _write(self) -> None:
         if not self._steps:
             return
-        table = traces.columns(self._schema, self._steps)
-        self._steps = []
+        table, beside = traces.columns(self._schema, self._steps), self._beside
+        self._steps, self._beside = [], []
+        frames = table["frame"]
+        first, last = int(frames.min()), int(frames.max())
+        self._span = (first, last) if self._span is None else (min(first, self._span[0]), max(last, self._span[1]))
         self._values(table)
-        self._surfaces(table)
-        self._overlays(table)
-        self._map(table)
+        self._drawing.write(table, beside)
         self._verdicts(table)
-        texts = traces.numbers(table)
-        media = _repeated(rr.TextDocument.columns(media_type=["text/markdown"]), len(texts))
-        self._send("numbers", table, rr.TextDocument.columns(text=texts), media)
 
     def _send(self, entity: str, table: traces.Columns, *columns: Iterable[Any]) -> None:
-        path = entity if entity.startswith("/") else f"{self._root}/{entity}"
-        self._file.send(path, table["frame"], table["t_ns"], *columns)
+        self._file.send(f"{self._root}/{entity}", table["frame"], table["t_ns"], *columns)
 
     def _values(self, table: traces.Columns) -> None:
         for entity, values in traces.scalar_groups(self._schema, table):
@@ -511,53 +375,6 @@ class RunWriter(_Writer):
         for entity, rows in self._schema.of(Archetype.INTEGERS).items():
             integers = {row.field: table[row.field] for row in rows}
             self._send(entity, table, rr.DynamicArchetype.columns(Archetype.INTEGERS.value, components=integers))
-
-    def _surfaces(self, table: traces.Columns) -> None:
-        root = f"{self._root}/{self._schema.entity('surface')}"
-        for group in traces.mosaics(table):
-            frames, t_ns = table["frame"][group.rows], table["t_ns"][group.rows]
-            n, height, width = group.images.shape
-            blobs = _blobs(list(group.images.view(np.uint8).reshape(n, -1)))
-            format_ = rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="F16")
-            self._file.send(
-                root, frames, t_ns,
-                rr.DepthImage.columns(buffer=blobs),
-                _repeated(rr.DepthImage.columns(format=[format_]), n),
-            )  # fmt: skip
-            for name, points in (("second", group.second), ("first", group.first)):
-                marks = traces.shapes(points, points)
-                columns = rr.Points2D.columns(positions=marks.points).partition(marks.counts)
-                self._file.send(f"{root}/{name}", frames, t_ns, columns)
-            if group.corners.tobytes() != self._arrangement:
-                self._arrangement = group.corners.tobytes()
-                labels = [str(k + 1) for k in range(len(group.corners))]
-                columns = rr.Points2D.columns(positions=group.corners + 1.5, labels=labels).partition([len(labels)])
-                self._file.send(f"{root}/labels", frames[:1], t_ns[:1], columns)
-
-    def _overlays(self, table: traces.Columns) -> None:
-        for name, drawn in traces.overlays(table).items():
-            colours: dict[str, Any] = {} if drawn.colours is None else {"colors": drawn.colours}
-            match name:
-                case "shifts":
-                    columns = rr.Arrows2D.columns(origins=drawn.points, vectors=drawn.extents, **colours)
-                case "tiles":
-                    columns = rr.Points2D.columns(positions=drawn.points, **colours)
-                case _:
-                    columns = rr.Boxes2D.columns(centers=drawn.points, half_sizes=drawn.extents, **colours)
-            self._send(f"{IMAGE}/{self._run}/{name}", table, columns.partition(drawn.counts))
-
-    def _map(self, table: traces.Columns) -> None:
-        raw, pose = table["pose_raw"], table["pose"]
-        colours = traces.verdict_colours(table["verdict"], _COLOURS["corrected"])
-        at, on_top = (_flat(pose[:, :2], layer) for layer in ("corrected", "markers"))
-        self._send(f"{self._world}/raw", table, rr.Points3D.columns(positions=_flat(raw[:, :2], "raw")))
-        self._send(f"{self._world}/corrected", table, rr.Points3D.columns(positions=at, colors=colours))
-        self._send(f"{self._world}/body", table, rr.Points3D.columns(positions=on_top))
-        half, angle = traces.ellipses(table["pose_covariance"])
-        turn = np.column_stack([np.zeros((len(at), 2)), np.sin(angle / 2), np.cos(angle / 2)])
-        columns = rr.Ellipsoids3D.columns(half_sizes=_flat(np.nan_to_num(half)), centers=at, quaternions=turn)
-        self._send(f"{self._world}/covariance", table, columns)
-        self._path.append((table["frame"], table["t_ns"], raw, pose))
 
     def _verdicts(self, table: traces.Columns) -> None:
         events, changes = self._changes.take(table)
@@ -589,26 +406,9 @@ class RunWriter(_Writer):
     def _log(self, entity: str, table: traces.Columns, events: Sequence[traces.Event]) -> None:
         if events:
             at = np.array([event.row for event in events])
-            self._file.send(f"{self._root}/{entity}", table["frame"][at], table["t_ns"][at], _texts(events))
+            self._file.send(f"{self._root}/{entity}", table["frame"][at], table["t_ns"][at], texts(events))
 
-    # ---- what is logged at the end
-
-    def _line(self, name: str, points: Floats) -> None:
-        finite = points[np.isfinite(points).all(axis=1)]
-        line = rr.LineStrips3D([_flat(finite, name)], colors=_COLOURS[name], radii=rr.Radius.ui_points(0.6))
-        self._file.static(f"{self._world}/path/{name}", line)
-
-    def _finish_path(self, frames: Ints, t_ns: Ints, raw: Floats, pose: Floats) -> None:
-        self._line("raw", raw[:, :2])
-        self._line("corrected", pose[:, :2])
-        given = self._bounds.extent
-        extent = Extent.of(np.concatenate([pose[:, :2], *([] if given is None else [given.corners])]))
-        good = np.isfinite(pose).all(axis=1)
-        self._file.scale_bar(extent)
-        vectors = ARROW_SHARE * extent.size_m * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
-        arrows = rr.Arrows3D.columns(vectors=_flat(vectors[good]), origins=_flat(pose[good, :2], "arrows"))
-        self._file.send(f"{self._world}/heading", frames[good], t_ns[good], arrows)
-        self._view(frames=(int(frames.min()), int(frames.max())), extent=extent)
+    # ---- the view
 
     def _view(self, **known: Any) -> None:
         """Send the view again with what is known by now."""

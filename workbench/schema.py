@@ -19,6 +19,7 @@ from typing import Any, NamedTuple, get_type_hints
 
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step, quantities
+from pipelines.ranging.step import RangeStep
 from readers.streams import WorkbenchError
 
 
@@ -216,7 +217,65 @@ CORRELATION = Schema(
     ),
 )  # fmt: skip
 
-SCHEMAS: Mapping[type[Step], Schema] = {CorrelationStep: CORRELATION}
+_XK = ("x", "y", "ξ")
+_P = tuple(f"{a}{b}" for a in _XK for b in _XK)
+_XYS = ("xx", "xy", "yx", "yy")
+_INPUTS = ("xω", "xV", "yω", "yV", "ξω", "ξV")
+_GAIN = ("xx", "xy", "yx", "yy", "ξx", "ξy")
+_SLOT = "`landmark/K/{}`".format
+_IMAGE = "`/camera/image/RUN/{}`".format
+
+RANGE = Schema(
+    RangeStep,
+    (
+        Row("frame", "frame", Archetype.TIMELINE),
+        Row("t_ns", "sensor_time", Archetype.TIMELINE),
+        Row("received_ns", "received", Archetype.INTEGERS),
+        Row("verdict", "outcome", also="state lane `verdict`; `events` where it changes"),
+        Row("alarms", "outcome", also="state lanes `verdicts/NAME`; lines of `alarms`"),
+        Row("omega_radps", "inputs/omega", title="ω", also=_TABLE),
+        Row("speed_mps", "inputs/speed", title="V", also=f"path from above; {_TABLE}"),
+        Row("dt_s", "inputs/dt", title="dt"),
+        Row("intervals", "inputs/intervals", title="intervals"),
+        Row("still", "inputs/intervals", title="stands still"),
+        Row("gyro_age_s", "inputs/age", title="age of ω"),
+        Row("odometer_age_s", "inputs/age", title="age of V"),
+        Row("gyro_bias_radps", "inputs/gyro_bias", title="gyro bias"),
+        Row("focus_px", "inputs/focus", axes=_UV, title="focus of expansion", also=f"cross {_IMAGE('focus')}"),
+        Row("landmarks", "count", title="carried"),
+        Row("measured", "count", title="measured"),
+        Row("converged", "count", title="converged"),
+        Row("landmark_id", "landmarks/id", title="number", also=f"labels on the image; {_TABLE}"),
+        Row("outcome", "landmarks/outcome", also=_TABLE),
+        Row("status", "landmarks/status", also=f"colours on the image and the map; {_TABLE}"),
+        Row("age_frames", "landmarks/age", title="age"),
+        Row("prior", "prior/state", axes=_XK, title="X⁻", also=f"crosses {_IMAGE('predicted')}"),
+        Row("prior_covariance", "prior/covariance", axes=_P, title="P⁻"),
+        Row("transition", "prior/transition", axes=_P, title="A"),
+        Row("noise_gain", "prior/noise_gain", axes=_INPUTS, title="G"),
+        Row("measured_px", "update/measured", axes=_UV, title="z", also=f"points {_IMAGE('measured')}"),
+        Row("innovation_px", "update/innovation", axes=_UV, title="ν",
+            also=f"{_SLOT('innovation')}; arrows {_IMAGE('innovation')}"),
+        Row("innovation_covariance", "update/innovation_covariance", axes=_XYS, title="S",
+            also=f"ellipses {_IMAGE('gate')}: the gate, χ² = 13.8; {_TABLE}"),
+        Row("gain", "update/gain", axes=_GAIN, title="K", also=f"{_SLOT('gain')}; {_TABLE}"),
+        Row("nis", "update/nis", title="NIS", also=f"{_SLOT('nis')}; {_TABLE}"),
+        Row("log_likelihood", "update/log_likelihood", title="log likelihood"),
+        Row("rejections", "update/rejections", title="rejections in a row"),
+        Row("mean", "posterior/state", axes=_XK, title="X", also=f"ξ: {_SLOT('xi')}; {_TABLE}"),
+        Row("covariance", "posterior/covariance", axes=_P, title="P", also=f"as σ: {_SLOT('sigma')}; {_TABLE}"),
+        Row("range_m", "range/range", title="Z",
+            also=f"{_SLOT('range')}; {_IMAGE('ranges')}; points from above; {_TABLE}"),
+        Row("range_interval_m", "range/interval", axes=("nearest", "farthest"), title="Z",
+            also=f"{_SLOT('range')}; rays from above; {_TABLE}"),
+        Row("relative_sigma", "range/relative_sigma", title="σ_ξ/ξ", also=f"{_SLOT('relative_sigma')}; {_TABLE}"),
+        Row("parallax_px", "range/parallax", title="parallax", also=f"{_SLOT('parallax')}"),
+        Row("derotated_parallax_px", "range/derotated_parallax", title="derotated", also=f"{_SLOT('parallax')}"),
+        Row("focus_distance_px", "range/focus_distance", title="to the focus", also=f"{_SLOT('parallax')}"),
+    ),
+)  # fmt: skip
+
+SCHEMAS: Mapping[type[Step], Schema] = {CorrelationStep: CORRELATION, RangeStep: RANGE}
 
 
 def schema_of(step_type: type[Step]) -> Schema:
@@ -263,6 +322,28 @@ This page is made by `python -m workbench.schema`; a test demands that it is cur
 | `/world/runs/RUN/path/NAME` | the whole path, raw, corrected and aligned with the reference |
 | `/camera/image/RUN/fragments`, `/search`, `/matches`, `/shifts` | drawn on the image |
 | `/camera/image/RUN/tiles` | where the photometric tiles were found; hidden until it is switched on |
+
+## Every run of the range filter
+Slot K is the place of a landmark in the arrays of a Step, from 1; the entities `landmark/K` repeat what is plotted
+of it, one entity per plot, for the first 24 slots. `reference` is what surveyed landmarks and a reference pose, a
+board, or measured ranges say; it is computed beside the estimator, which never sees it.
+
+| Entity | What |
+|---|---|
+| `/runs/RUN/range/landmark/K/range` | Z, nearest and farthest (ξ ± 2 σ_ξ), reference (m) |
+| `/runs/RUN/range/landmark/K/xi` | ξ, ξ - 2σ, ξ + 2σ, reference (1/m) |
+| `/runs/RUN/range/landmark/K/sigma`, `/relative_sigma` | σ_x, σ_y (px); σ_ξ/ξ |
+| `/runs/RUN/range/landmark/K/innovation` | ν_x, ν_y, ± 2 √S_xx, ± 2 √S_yy (px) |
+| `/runs/RUN/range/landmark/K/nis` | NIS |
+| `/runs/RUN/range/landmark/K/gain` | K: of x and y (1), of ξ (1/m/px) |
+| `/runs/RUN/range/landmark/K/parallax` | parallax, derotated parallax, distance to the focus of expansion (px) |
+| `/runs/RUN/range/bounds/nis` | 5.99 (95 % of χ² with 2 degrees of freedom), 13.8 (99.9 %, the gate) |
+| `/runs/RUN/range/reference` | reference depth of every slot (m) |
+| `/camera/image/RUN/measured`, `/predicted`, `/innovation`, `/gate`, `/focus` | drawn on the image |
+| `/camera/image/RUN/ranges` | the landmarks coloured by their range, red near, blue far |
+| `/world/runs/RUN/camera`, `/camera/path` | where the camera is: reference, else dead reckoned |
+| `/world/runs/RUN/landmarks/points`, `/rays`, `/ellipses` | the landmarks from above, with their intervals and 2σ |
+| `/world/runs/RUN/landmarks/surveyed` | where they are, if that is known |
 """
 
 

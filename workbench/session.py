@@ -29,7 +29,7 @@ import numpy as np
 from pipelines.estimator import Estimator, Step
 from pipelines.evaluation import Evaluation, EvaluationError, Trajectory, evaluate, mean_angle, path_lengths
 from pipelines.geometry import Floats, wrap_angle
-from pipelines.replay import Replayed, replay
+from pipelines.replay import Frame, Replayed, replay
 from pipelines.verdict import Severity
 from readers.clock import StreamAudit
 from readers.streams import (
@@ -44,7 +44,8 @@ from readers.streams import (
     StreamError,
     StreamInfo,
 )
-from workbench import inputs
+from workbench import inputs, range_inputs
+from workbench.range_account import RangeAccount
 from workbench.settings import Plugin, Resolved, SettingsError, plugin, resolve, settings_values, to_toml
 from workbench.summary import Tally, evaluation_values, lines, suitability
 
@@ -60,9 +61,10 @@ CALIBRATION_AGREES = 0.05
 class Request:
     """What a user asks of one replay.
 
-    `start` and `stop` are times as `inputs.parse_time` reads them; `image`, `reference` and `height` are names
-    of streams, ``none`` for no reference or height; `reference_offset_s` is added to the frames' times before
-    the reference is looked up; `raw_images` says how images without a viewable stored form are kept.
+    `start` and `stop` are times as `inputs.parse_time` reads them; `image`, `reference`, `height`, `tracks`,
+    `odometry` and `imu` are names of streams, ``none`` for one that is not to be used; `reference_offset_s` is added
+    to the frames' times before the reference is looked up; `raw_images` says how images without a viewable stored
+    form are kept.
     """
 
     path: Path
@@ -79,6 +81,9 @@ class Request:
     reference: str | None = None
     reference_offset_s: float = 0.0
     height: str | None = None
+    tracks: str | None = None
+    odometry: str | None = None
+    imu: str | None = None
     options: ReadOptions = field(default_factory=ReadOptions)
     calibrate: bool = False
     raw_images: str = "png"
@@ -119,7 +124,7 @@ class SensorLog(Protocol):
 class RunLog(Protocol):
     """What the session needs of `workbench.rrd.RunWriter`."""
 
-    def step(self, step: Step) -> None: ...  # noqa: D102
+    def step(self, step: Step, beside: Any = None) -> None: ...  # noqa: D102
     def event(self, frame: int, t_ns: int, severity: Severity, text: str) -> None: ...  # noqa: D102
     def errors(self, frames: Any, t_ns: Any, values: Floats) -> None: ...  # noqa: D102
     def finish(self, summary: Mapping[str, str | float | int], aligned_path: Floats | None) -> None: ...  # noqa: D102
@@ -130,8 +135,9 @@ class Writers(NamedTuple):
     """What makes the writers of the two kinds of files.
 
     Both are called with the file and, by name, the `recording_id`, the `run`, the name of its `estimator` and its
-    `step_type`; `sensors` with `raw_images` as well, `run` with `settings_text` and `ground` [n, 2], positions of
-    the reference in m that the map shows (None where there are none, or the path is not in metres).
+    `step_type`; `sensors` with `raw_images` as well, `run` with `settings_text`, `ground` [n, 2], positions of the
+    reference in m that the map shows (None where there are none, or the path is not in metres), and `scene`, what
+    the drawing of this estimator's steps needs to know beyond them.
     """
 
     sensors: Callable[..., SensorLog]
@@ -262,10 +268,44 @@ def _prepare(
     request: Request, recording: Recording, estimator: Plugin, resolved: Resolved, name: str, preset: str
 ) -> _Session:
     """Make every choice that can fail before anything is written."""
+    choose = _choose_for_ranges if estimator.answers == "ranges" else _choose_for_path
+    chosen = choose(request, recording, resolved)
+    return _Session(
+        request=request,
+        recording=_Audited(recording),
+        estimator=estimator.build(chosen.resolved.settings),
+        name=name,
+        preset=preset,
+        folder=run_folder(request),
+        chosen=chosen,
+        notes=[*recording.notes, *chosen.notes],
+        digest=inputs.digest_of(recording, request.path),
+    )
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class _Chosen:
+    """What a replay takes of its recording: streams, window, reference; the settings that follow; who judges."""
+
+    frames: str
+    others: tuple[str, ...]
+    shown: str = ""
+    start_ns: int | None
+    stop_ns: int | None
+    resolved: Resolved
+    reference: inputs.Reference
+    account: Account
+    ground: Floats | None
+    scene: Any = None
+    notes: Sequence[str] = ()
+
+
+def _choose_for_path(request: Request, recording: Recording, resolved: Resolved) -> _Chosen:
+    """The choices of an estimator of the vehicle's path: images, height, scale, start."""
     image = inputs.choose_images(recording, request.image)
     start_ns, stop_ns = _window(request, recording, image)
     first = inputs.first_frame(recording, image, start_ns, stop_ns)
-    offset_ns = round(request.reference_offset_s * 1e9)
+    offset_ns = _offset_ns(request)
     reference = inputs.load_reference(recording, request.reference, start_ns, stop_ns, offset_ns)
     reference = inputs.overlapping(recording, reference, request.reference, image, first.t_ns, offset_ns)
     if request.calibrate and not reference.poses:
@@ -276,30 +316,63 @@ def _prepare(
     stream = getattr(resolved.settings, "height_stream", "")
     if stream:
         recording.stream(stream)
-    return _Session(
-        request=request,
-        recording=_Audited(recording),
-        estimator=estimator.build(resolved.settings),
-        name=name,
-        preset=preset,
-        folder=run_folder(request),
-        image=image,
+    return _Chosen(
+        frames=image,
         others=(stream,) if stream and stream != image else (),
         start_ns=start_ns,
         stop_ns=stop_ns,
+        resolved=resolved,
         reference=reference,
-        offset_ns=offset_ns,
-        scale=scale,
-        notes=[*recording.notes, *notes],
-        digest=inputs.digest_of(recording, request.path),
+        account=_PathAccount(request.calibrate, resolved.settings, reference, offset_ns, scale),
+        ground=reference.path.pose[:, :2] if reference.poses and scale.known else None,
+        notes=notes,
     )
 
 
-def _window(request: Request, recording: Recording, image: str) -> tuple[int | None, int | None]:
+def _choose_for_ranges(request: Request, recording: Recording, resolved: Resolved) -> _Chosen:
+    """The choices of an estimator of ranges to landmarks: frames, odometry, IMU, camera."""
+    if request.calibrate:
+        raise SettingsError("--calibrate is for estimators of a path; this one estimates ranges")
+    streams = range_inputs.choose_streams(
+        recording,
+        resolved.settings,
+        tracks=request.tracks,
+        image=request.image,
+        odometry=request.odometry,
+        imu=request.imu,
+    )
+    start_ns, stop_ns = _window(request, recording, streams.frames)
+    inputs.first_time(recording, streams.frames, start_ns, stop_ns)
+    offset_ns = _offset_ns(request)
+    reference = range_inputs.load_reference(recording, request.reference, start_ns, stop_ns, offset_ns)
+    camera = range_inputs.camera_of(recording, streams)
+    resolved, notes = range_inputs.with_camera(resolved, recording, camera, streams)
+    landmarks = range_inputs.landmarks_of(recording)
+    account = RangeAccount.of(resolved, landmarks, reference, streams, offset_ns)
+    return _Chosen(
+        frames=streams.frames,
+        others=streams.others,
+        shown=streams.shown,
+        start_ns=start_ns,
+        stop_ns=stop_ns,
+        resolved=resolved,
+        reference=reference,
+        account=account,
+        ground=None,
+        scene=account.scene,
+        notes=[*streams.notes, *notes],
+    )
+
+
+def _offset_ns(request: Request) -> int:
+    return round(request.reference_offset_s * 1e9)
+
+
+def _window(request: Request, recording: Recording, frames: str) -> tuple[int | None, int | None]:
     """The window in nanoseconds; the beginning of the recording is read only if its time is needed."""
     if request.start is None and request.stop is None:
         return None, None
-    origin_ns = inputs.first_frame(recording, image, None, None).t_ns
+    origin_ns = inputs.first_time(recording, frames, None, None)
     start_ns, stop_ns = (
         None if text is None else inputs.parse_time(text, origin_ns) for text in (request.start, request.stop)
     )
@@ -309,7 +382,7 @@ def _window(request: Request, recording: Recording, image: str) -> tuple[int | N
 
 
 class _Audited(Recording):
-    """A recording whose image stream is audited while it is read."""
+    """A recording whose streams are audited while they are read."""
 
     def __init__(self, inner: Recording) -> None:
         self.path, self.format, self.notes = inner.path, inner.format, inner.notes
@@ -341,27 +414,110 @@ class _Audited(Recording):
         return [str(damage) for damage in self._inner.damage]
 
 
+class Account(Protocol):
+    """Follows the steps of a run and says at its end what they are worth."""
+
+    @property
+    def trajectory(self) -> bool:
+        """Whether the steps tell the vehicle's path."""
+        ...
+
+    def take(self, step: Step, sample: Frame, /) -> Any:
+        """Take note of one step; what is known of its frame from elsewhere, for the log (see `RunLog.step`)."""
+        ...
+
+    def conclude(self, run: RunLog, tally: Tally, median_dt_s: float, /) -> tuple[dict[str, Any], Floats | None]:
+        """What the summary says of the result; and the path [n, 2] aligned with the reference, None for none."""
+        ...
+
+
 @dataclass(slots=True)
-class _Path:
-    """The trajectory of a run while it grows: 40 bytes a frame."""
+class _Span:
+    """The times of a run's frames while they pass: 8 bytes a frame; and the number of the last one."""
 
-    frames: array[int] = field(default_factory=lambda: array("q"))
+    frame: int = -1
     t_ns: array[int] = field(default_factory=lambda: array("q"))
-    poses: array[float] = field(default_factory=lambda: array("d"))
 
-    def add(self, step: Step, pose: Floats) -> None:
-        """Take the pose (x, y, heading) of one step."""
-        self.frames.append(step.frame)
+    def add(self, step: Step) -> None:
+        self.frame = step.frame
         self.t_ns.append(step.t_ns)
-        self.poses.extend(float(v) for v in pose)
 
-    def times(self) -> Any:
-        """Times in nanoseconds, int64 [n]."""
-        return np.array(self.t_ns, dtype=np.int64)
+    @property
+    def duration_s(self) -> float:
+        return float(self.t_ns[-1] - self.t_ns[0]) / 1e9 if self.t_ns else 0.0
 
-    def pose(self) -> Floats:
-        """Poses, float64 [n, 3]."""
-        return np.array(self.poses, dtype=np.float64).reshape(-1, 3)
+    @property
+    def median_dt_s(self) -> float:
+        return float(np.median(np.diff(np.array(self.t_ns)))) / 1e9 if len(self.t_ns) > 1 else math.nan
+
+
+class _PathAccount:
+    """The account of an estimator of the vehicle's path: its trajectory, held against the reference.
+
+    The trajectory takes 40 bytes a frame.
+    """
+
+    trajectory = True
+
+    def __init__(
+        self, calibrate: bool, settings: Any, reference: inputs.Reference, offset_ns: int, scale: inputs.Scale
+    ) -> None:
+        self._calibrate, self._settings = calibrate, settings
+        self._reference, self._offset_ns, self._scale = reference, offset_ns, scale
+        self._frames, self._t_ns, self._poses = array("q"), array("q"), array("d")
+
+    def take(self, step: Step, sample: Frame) -> None:
+        """Take the pose (x, y, heading) of one step."""
+        pose = getattr(step, "pose", None)
+        if pose is not None:
+            self._frames.append(step.frame)
+            self._t_ns.append(step.t_ns)
+            self._poses.extend(float(v) for v in pose)
+
+    def conclude(self, run: RunLog, tally: Tally, median_dt_s: float) -> tuple[dict[str, Any], Floats | None]:
+        """Hold the path against the reference and log its errors."""
+        poses = np.array(self._poses, dtype=np.float64).reshape(-1, 3)
+        estimate = Trajectory.of(np.array(self._t_ns, dtype=np.int64), poses)
+        evaluation, refused = self._evaluate(estimate)
+        aligned = None
+        if evaluation is not None:
+            aligned = evaluation.alignment(estimate.pose)[:, :2]
+            frames = self._frames_of(estimate)[evaluation.index]
+            run.errors(frames=frames, t_ns=estimate.t_ns[evaluation.index], values=evaluation.errors)
+        return {
+            "path_length": float(path_lengths(poses[:, :2])[-1]) if len(poses) else 0.0,
+            "unit": self._scale.unit,
+            "scale": self._scale.sentence,
+            "reference": refused,
+            "evaluation": None if evaluation is None else evaluation_values(evaluation),
+            "calibration": self._calibration(evaluation),
+            "suitability": suitability(tally, median_dt_s, evaluation),
+        }, aligned
+
+    def _frames_of(self, estimate: Trajectory) -> Any:
+        """The frame numbers [n] of a trajectory's poses, which are in the order of time."""
+        times, first = np.unique(np.array(self._t_ns, dtype=np.int64), return_index=True)
+        frames = np.array(self._frames, dtype=np.int64)[first]
+        return frames[np.searchsorted(times, estimate.t_ns)]
+
+    def _evaluate(self, estimate: Trajectory) -> tuple[Evaluation | None, str]:
+        """The evaluation, and what the reference is; or why there is none."""
+        reference = self._reference
+        if not reference.poses:
+            return None, reference.sentence
+        try:
+            result = evaluate(estimate, reference.path, with_scale=not self._scale.known, offset_ns=self._offset_ns)
+        except EvaluationError as error:
+            return None, f"{reference.sentence}; not compared: {error}"
+        return result, reference.sentence
+
+    def _calibration(self, evaluation: Evaluation | None) -> dict[str, Any] | None:
+        """The settings that bring the path over the reference, None if nobody asked."""
+        if not self._calibrate:
+            return None
+        if evaluation is None:
+            return {"key": "", "sentence": "not possible: the run cannot be compared with a reference"}
+        return calibration(self._settings, evaluation)
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -374,13 +530,7 @@ class _Session:
     name: str
     preset: str
     folder: Path
-    image: str
-    others: tuple[str, ...]
-    start_ns: int | None
-    stop_ns: int | None
-    reference: inputs.Reference
-    offset_ns: int
-    scale: inputs.Scale
+    chosen: _Chosen
     notes: list[str]
     digest: str
 
@@ -409,25 +559,32 @@ class _Session:
         self, writers: Writers, interrupt: Interrupt, on_progress: Callable[[Progress], None] | None
     ) -> dict[str, Any]:
         """Replay and write the recordings and the trajectory; the summary."""
-        tally, path, stopped = Tally(), _Path(), ""
+        tally, span, stopped = Tally(), _Span(), ""
         with contextlib.ExitStack() as files:
             sensors = self._sensors(writers, files)
             run = files.enter_context(contextlib.closing(self._run_writer(writers)))
-            tum = files.enter_context(self._file("tum").open("w", encoding="ascii"))
+            tum = self._trajectory(files)
             steps = files.enter_context(contextlib.closing(self._steps(on_progress)))
             try:
                 for replayed in steps:
-                    self._take(replayed, sensors, run, tum, tally, path)
+                    self._take(replayed, sensors, run, tum, tally, span)
                     if interrupt.requested:
                         break
             except RecordingError as error:
                 if not tally.frames:
                     raise
                 stopped = str(error)
-            summary = self._finish(sensors, run, tally, path, interrupt.requested, stopped)
+            summary = self._finish(sensors, run, tally, span, interrupt.requested, stopped)
         if sensors is not None and not summary["interrupted"] and not stopped:
             _replace(self.folder / "sensors.toml", to_toml(self._sensors_values()))
         return summary | {"interrupted": interrupt.requested}
+
+    def _trajectory(self, files: contextlib.ExitStack) -> TextIO | None:
+        """The file of the trajectory, None where the estimator has none; one of an earlier run of that name goes."""
+        if self.chosen.account.trajectory:
+            return files.enter_context(self._file("tum").open("w", encoding="ascii"))
+        self._file("tum").unlink(missing_ok=True)
+        return None
 
     def _steps(self, on_progress: Callable[[Progress], None] | None) -> Generator[Replayed]:
         total = self._expected()
@@ -439,63 +596,57 @@ class _Session:
         return replay(
             self.recording,
             self.estimator,
-            image_stream=self.image,
-            other_streams=self.others,
-            start_ns=self.start_ns,
-            stop_ns=self.stop_ns,
+            image_stream=self.chosen.frames,
+            other_streams=self.chosen.others,
+            shown_stream=self.chosen.shown,
+            start_ns=self.chosen.start_ns,
+            stop_ns=self.chosen.stop_ns,
             stride=self.request.stride,
             on_progress=tell,
         )
 
     def _take(
-        self, replayed: Replayed, sensors: SensorLog | None, run: RunLog, tum: TextIO, tally: Tally, path: _Path
+        self, replayed: Replayed, sensors: SensorLog | None, run: RunLog, tum: TextIO | None, tally: Tally, span: _Span
     ) -> None:
         step, sample = replayed.step, replayed.sample
-        if sensors is not None:
-            _log_sample(sensors, step, sample)
-        run.step(step)
+        image = replayed.shown if self.chosen.shown else sample
+        if sensors is not None and isinstance(image, ImageSample | Problem):
+            _log_sample(sensors, step, image)
+        run.step(step, self.chosen.account.take(step, sample))
         if isinstance(sample, Problem):
             run.event(step.frame, step.t_ns, Severity.ERROR, sample.reason)
         tally.add(step.verdict, step.alarms, bool(getattr(step, "accepted", True)))
+        span.add(step)
         pose = getattr(step, "pose", None)
-        if pose is not None:
-            path.add(step, pose)
+        if tum is not None and pose is not None:
             tum.write(tum_line(step.t_ns, pose))
 
     def _expected(self) -> int | None:
         """How many frames there will be, as far as the recording says it."""
-        info = self.recording.stream(self.image)
+        info, start_ns, stop_ns = self.recording.stream(self.chosen.frames), self.chosen.start_ns, self.chosen.stop_ns
         if info.count < 0:
             return None
         share = 1.0
-        if (self.start_ns is not None or self.stop_ns is not None) and info.last_ns > info.first_ns:
-            first = max(info.first_ns, self.start_ns if self.start_ns is not None else info.first_ns)
-            last = min(info.last_ns, self.stop_ns if self.stop_ns is not None else info.last_ns)
+        if (start_ns is not None or stop_ns is not None) and info.last_ns > info.first_ns:
+            first = max(info.first_ns, start_ns if start_ns is not None else info.first_ns)
+            last = min(info.last_ns, stop_ns if stop_ns is not None else info.last_ns)
             share = min(1.0, max(0.0, (last - first) / (info.last_ns - info.first_ns)))
         return math.ceil(share * info.count / self.request.stride)
 
     # ---- the end
 
     def _finish(
-        self, sensors: SensorLog | None, run: RunLog, tally: Tally, path: _Path, interrupted: bool, stopped: str
+        self, sensors: SensorLog | None, run: RunLog, tally: Tally, span: _Span, interrupted: bool, stopped: str
     ) -> dict[str, Any]:
         """Judge the run, log what is known at its end, and return the summary."""
-        estimate = Trajectory.of(path.times(), path.pose())
-        evaluation, refused = self._evaluate(estimate)
         facts, damage = self.recording.facts(), self.recording.damage_lines()
-        summary = self._summary(tally, path, evaluation, refused, interrupted, stopped)
-        summary |= {"facts": facts, "damage": damage}
-        aligned = None
-        if evaluation is not None:
-            aligned = evaluation.alignment(estimate.pose)[:, :2]
-            frames = _frames_of(path, estimate)[evaluation.index]
-            run.errors(frames=frames, t_ns=estimate.t_ns[evaluation.index], values=evaluation.errors)
-        if len(path.frames):
-            frame, t_ns = path.frames[-1], path.t_ns[-1]
+        found, aligned = self.chosen.account.conclude(run, tally, span.median_dt_s)
+        summary = self._summary(tally, span, found, interrupted, stopped) | {"facts": facts, "damage": damage}
+        if tally.frames:
             for text in damage:
-                run.event(frame, t_ns, Severity.WARNING, f"damage: {text}")
+                run.event(span.frame, span.t_ns[-1], Severity.WARNING, f"damage: {text}")
             if stopped:
-                run.event(frame, t_ns, Severity.ERROR, stopped)
+                run.event(span.frame, span.t_ns[-1], Severity.ERROR, stopped)
         if sensors is not None:
             oddities = [*(f"damage: {text}" for text in damage), *facts]
             sensors.facts([*self._contents(), *self.notes, *(oddities or ["nothing odd was met"])])
@@ -509,59 +660,26 @@ class _Session:
             count = f", {stream.count} messages" if stream.count >= 0 else ""
             yield f"`{stream.name}`: {stream.kind}{count}"
 
-    def _evaluate(self, estimate: Trajectory) -> tuple[Evaluation | None, str]:
-        """The evaluation, or why there is none."""
-        if not self.reference.poses:
-            return None, self.reference.sentence
-        try:
-            result = evaluate(estimate, self.reference.path, with_scale=not self.scale.known, offset_ns=self.offset_ns)
-        except EvaluationError as error:
-            return None, f"{self.reference.sentence}; not compared: {error}"
-        return result, self.reference.sentence
-
     def _summary(
-        self,
-        tally: Tally,
-        path: _Path,
-        evaluation: Evaluation | None,
-        reference: str,
-        interrupted: bool,
-        stopped: str,
+        self, tally: Tally, span: _Span, found: Mapping[str, Any], interrupted: bool, stopped: str
     ) -> dict[str, Any]:
-        times = path.times()
-        gaps = np.diff(times) / 1e9
-        median_dt_s = float(np.median(gaps)) if len(gaps) else math.nan
         return {
             "recording": str(self.request.path),
             "format": self.recording.format,
             "estimator": self.estimator.name,
             "preset": self.preset,
             "run": self.name,
-            "image_stream": self.image,
+            "image_stream": self.chosen.frames,
             "frames": tally.frames,
-            "duration_s": float(times[-1] - times[0]) / 1e9 if len(times) else 0.0,
-            "median_dt_s": median_dt_s,
+            "duration_s": span.duration_s,
+            "median_dt_s": span.median_dt_s,
             "verdicts": tally.named(),
             "alarms": tally.named_alarms(),
-            "path_length": float(path_lengths(path.pose()[:, :2])[-1]) if len(times) else 0.0,
-            "unit": self.scale.unit,
-            "scale": self.scale.sentence,
-            "reference": reference,
-            "evaluation": None if evaluation is None else evaluation_values(evaluation),
-            "calibration": self._calibration(evaluation),
-            "suitability": suitability(tally, median_dt_s, evaluation),
+            **found,
             "notes": self.notes,
             "interrupted": interrupted,
             "stopped_early": stopped,
         }
-
-    def _calibration(self, evaluation: Evaluation | None) -> dict[str, Any] | None:
-        """The settings that bring the path over the reference, None if nobody asked."""
-        if not self.request.calibrate:
-            return None
-        if evaluation is None:
-            return {"key": "", "sentence": "not possible: the run cannot be compared with a reference"}
-        return calibration(self.estimator.settings, evaluation)
 
     # ---- files
 
@@ -584,7 +702,7 @@ class _Session:
             step_type=self.estimator.step_type,
         )
         files.enter_context(contextlib.closing(writer))
-        writer.reference(self.reference.poses)
+        writer.reference(self.chosen.reference.poses)
         return writer
 
     def _run_writer(self, writers: Writers) -> RunLog:
@@ -595,7 +713,8 @@ class _Session:
             estimator=self.estimator.name,
             step_type=self.estimator.step_type,
             settings_text=to_toml(settings_values(self.estimator.settings)),
-            ground=self.reference.path.pose[:, :2] if self.reference.poses and self.scale.known else None,
+            ground=self.chosen.ground,
+            scene=self.chosen.scene,
         )
 
     @property
@@ -604,14 +723,14 @@ class _Session:
         return self.digest[:32]
 
     def _window_values(self) -> dict[str, Any]:
-        return {"start_ns": self.start_ns, "stop_ns": self.stop_ns, "stride": self.request.stride}
+        return {"start_ns": self.chosen.start_ns, "stop_ns": self.chosen.stop_ns, "stride": self.request.stride}
 
     def _sensors_values(self) -> dict[str, Any]:
         return {
             "format": FORMAT,
             "digest": self.digest,
-            "image_stream": self.image,
-            "reference_stream": self.reference.stream,
+            "image_stream": self.chosen.shown or self.chosen.frames,
+            "reference_stream": self.chosen.reference.stream,
             "raw_images": self.request.raw_images,
             "window": self._window_values(),
             "versions": {"estimator-workbench": _version("estimator-workbench"), "rerun-sdk": _version("rerun-sdk")},
@@ -628,8 +747,8 @@ class _Session:
                 "preset": self.preset,
                 "recording": str(self.request.path),
                 "digest": self.digest,
-                "image_stream": self.image,
-                "reference_stream": self.reference.stream,
+                "image_stream": self.chosen.frames,
+                "reference_stream": self.chosen.reference.stream,
                 "reference_offset_s": self.request.reference_offset_s,
             },
             "window": self._window_values(),
@@ -699,13 +818,6 @@ def _log_sample(sensors: SensorLog, step: Step, sample: ImageSample | Problem) -
         sensors.image(step.frame, sample)
     except ImageError as error:
         sensors.undecodable(step.frame, step.t_ns, str(error))
-
-
-def _frames_of(path: _Path, estimate: Trajectory) -> Any:
-    """The frame numbers [n] of a trajectory's poses, which are in the order of time."""
-    times, first = np.unique(path.times(), return_index=True)
-    frames = np.array(path.frames, dtype=np.int64)[first]
-    return frames[np.searchsorted(times, estimate.t_ns)]
 
 
 def _flat(rows: Sequence[tuple[str, str]]) -> dict[str, str]:

@@ -13,7 +13,7 @@ from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 from readers.streams import WorkbenchError
 
@@ -39,7 +39,8 @@ class SettingsError(WorkbenchError):
 class Plugin:
     """An estimator that can be asked for by name.
 
-    `settings` is its frozen pydantic model with ``extra="forbid"``; where that has presets, it has the class
+    `answers` says what its steps are about: the vehicle's ``path``, or ``ranges`` to landmarks. `settings` is its
+    frozen pydantic model with ``extra="forbid"``; where that has presets, it has the class
     methods ``presets() -> tuple[str, ...]`` and ``preset(name)``. `build` makes the estimator of such settings.
     Another package offers one under the entry point group `estimator_workbench.estimators`, as a `Plugin` or
     as a function without arguments that returns one.
@@ -48,6 +49,7 @@ class Plugin:
     name: str
     settings: type[BaseModel]
     build: Callable[[Any], Estimator[Any]]
+    answers: Literal["path", "ranges"] = "path"
 
     @property
     def presets(self) -> tuple[str, ...]:
@@ -84,7 +86,7 @@ def _range() -> Plugin:
     from pipelines.ranging.range_filter import RangeFilter
     from pipelines.ranging.range_settings import RangeSettings
 
-    return Plugin("range", RangeSettings, RangeFilter)
+    return Plugin("range", RangeSettings, RangeFilter, "ranges")
 
 
 BUILT_IN: Mapping[str, Callable[[], Plugin]] = {"correlation": _correlation, "range": _range}

@@ -14,6 +14,7 @@ from pipelines.verdict import Severity, Verdict, flags, gravest
 NOTABLE_SHARE = 0.05
 TRUSTED_SHARE = 0.5
 MOST_CAUSES = 6
+MOST_LANDMARKS = 24
 SLOW_FRAMES_S = 0.5
 NOTABLE_DRIFT = 0.05
 STILL_M = 0.05
@@ -113,11 +114,66 @@ def suitability(tally: Tally, median_dt_s: float, evaluation: Evaluation | None 
             f"median time between frames {median_dt_s:.3g} s: the method expects frames that overlap by far, "
             "as at video rate; between distant frames its motion prediction has nothing to go by"
         )
+    causes += _causes(tally)
+    return [_upshot(tally, bool(causes)), *causes[:MOST_CAUSES]]
+
+
+NIS_APART = 1.3
+"""Ratio of the mean NIS to its expectation, or the inverse, from which the filter's noise settings are wrong."""
+NEES_APART = 2.0
+"""The same of the NEES against the reference, which has errors of its own."""
+LEAST_COVERAGE = 0.8
+
+
+def range_suitability(tally: Tally, ranging: Mapping[str, Any]) -> list[str]:
+    """Plain sentences on what the ranges of a run are worth: the upshot first, then the gravest causes."""
+    if not ranging["landmarks"]:
+        return ["do not trust: no landmark was ever found", *_causes(tally)]
+    doubts, causes = _range_doubts(ranging), _causes(tally)
+    share = percent(ranging["converged_share"])
+    good = (
+        f"{ranging['converged_landmarks']} of {ranging['landmarks']} landmarks converged; {share} of the ranges count"
+    )
+    if doubts:
+        return [f"do not trust the uncertainties: {good}", *doubts, *causes][:MOST_CAUSES]
+    if not ranging["converged_landmarks"]:
+        return [f"no range counts: {good}", *causes][:MOST_CAUSES]
+    told = "look at what follows" if causes else "the innovations are what the filter expects"
+    return [f"{good}; {told}", *causes][:MOST_CAUSES]
+
+
+def _range_doubts(ranging: Mapping[str, Any]) -> list[str]:
+    """What speaks against the filter's own uncertainties: NIS, and NEES where a reference is."""
+    doubts = []
+    nis = ranging["nis"]
+    ratio = nis["mean"] / nis["expected"]
+    if ratio > NIS_APART or ratio < 1 / NIS_APART:
+        size = "larger" if ratio > 1 else "smaller"
+        doubts.append(
+            f"mean NIS {nis['mean']:.3g} where {nis['expected']:.0f} is expected: the innovations are {size} than the "
+            "filter's noise settings say"
+        )
+    error = ranging["error"]
+    if error is None:
+        return doubts
+    if error["nees"] > NEES_APART or error["coverage"] < LEAST_COVERAGE:
+        doubts.append(
+            f"NEES {error['nees']:.3g} of the inverse depth where 1 is expected, {percent(error['coverage'])} within "
+            "2σ where 95 % are: the ranges are worse than the filter says"
+        )
+    elif error["nees"] < 1 / (2 * NEES_APART):
+        doubts.append(f"NEES {error['nees']:.3g} where 1 is expected: the ranges are better than the filter says")
+    return doubts
+
+
+def _causes(tally: Tally) -> list[str]:
+    """The alarms that many frames have and that can be acted on, gravest first."""
+    causes = []
     for verdict in sorted(ADVICE, key=lambda v: (v.severity, tally.alarms[v]), reverse=True):
-        share = tally.alarms[verdict] / tally.frames
+        share = tally.alarms[verdict] / tally.frames if tally.frames else 0.0
         if share >= NOTABLE_SHARE:
             causes.append(f"{percent(share)} of the frames {name_of(verdict)}: {ADVICE[verdict]}")
-    return [_upshot(tally, bool(causes)), *causes[:MOST_CAUSES]]
+    return causes
 
 
 def _disagreement(evaluation: Evaluation | None) -> list[str]:
@@ -231,12 +287,12 @@ def lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ("estimator", f"{summary['estimator']}, preset {summary['preset']}, run {summary['run']}"),
         ("frames", _frames(summary)),
         ("verdicts", _counts(summary["verdicts"])),
-        ("path length", f"{summary['path_length']:.4g} {summary['unit']}"),
-        ("scale", summary["scale"]),
     ]
     if summary["alarms"] != {name: n for name, n in summary["verdicts"].items() if name != "OK"}:
-        rows.insert(4, ("alarms", _counts(summary["alarms"])))
-    rows += _evaluation_lines(summary)
+        rows.append(("alarms", _counts(summary["alarms"])))
+    if "path_length" in summary:
+        rows += [("path length", f"{summary['path_length']:.4g} {summary['unit']}"), ("scale", summary["scale"])]
+    rows += _range_lines(summary) if "ranging" in summary else _evaluation_lines(summary)
     if summary.get("calibration"):
         rows.append(("calibration", summary["calibration"]["sentence"]))
     for key, title in (("suitability", "suitability"), ("notes", "note"), ("damage", "damage"), ("facts", "fact")):
@@ -275,6 +331,45 @@ def _evaluation_lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     if not math.isnan(result["yaw_drift_deg"]):
         rows.append(("yaw drift", f"{result['yaw_drift_deg']:.3g}°, {result['yaw_drift_deg_per_m']:.3g}°/m"))
     return rows + [("reference", note) for note in result["notes"]]
+
+
+def _range_lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The landmarks of a run, all together and one by one."""
+    found, nis = summary["ranging"], summary["ranging"]["nis"]
+    wait = "" if math.isnan(found["time_to_converge_s"]) else f" after {found['time_to_converge_s']:.3g} s (median)"
+    counts = f"{found['updates']} updates, {found['rejected']} rejected, {found['resets']} resets, {found['lost']} lost"
+    rows = [
+        ("landmarks", f"{found['landmarks']} in {found['starts']} starts; {counts}"),
+        ("converged", f"{found['converged_landmarks']} landmarks{wait}; {percent(found['converged_share'])} of ranges"),
+        (
+            "NIS",
+            f"mean {nis['mean']:.3g}, none counted above 13.8; {nis['expected']:.0f} expected, "
+            f"95 % in {nis['low']:.3g}…{nis['high']:.3g}",
+        ),
+        ("reference", summary["reference"]),
+    ]
+    if found["error"] is not None:
+        rows.append(("range error", f"{_range_error(found['error'])} of {found['error']['count']} ranges that count"))
+    shown = found["per_landmark"][:MOST_LANDMARKS]
+    rows += [("landmark", _one_landmark(one)) for one in shown]
+    if len(found["per_landmark"]) > len(shown):
+        rows.append(("landmark", f"{len(found['per_landmark']) - len(shown)} more; --json has them all"))
+    return rows
+
+
+def _one_landmark(one: Mapping[str, Any]) -> str:
+    wait = "never converged"
+    if not math.isnan(one["time_to_converge_s"]):
+        wait = f"converged after {one['time_to_converge_s']:.3g} s"
+    starts = f", {one['starts']} starts" if one["starts"] > 1 else ""
+    error = "" if one["error"] is None else f"; {_range_error(one['error'])}"
+    rejected = f", {one['rejected']} rejected" if one["rejected"] else ""
+    return f"{one['landmark']}: {wait}{starts}{error}; NIS {one['nis']:.3g} of {one['updates']} updates{rejected}"
+
+
+def _range_error(error: Mapping[str, float]) -> str:
+    sizes = ", ".join(f"{name} {error[f'{name.lower()}_percent']:.3g} %" for name in ("median", "RMS", "bias"))
+    return f"{sizes}, NEES {error['nees']:.3g}, {percent(error['coverage'])} within 2σ"
 
 
 def _statistics(values: Mapping[str, float], unit: str, what: str) -> str:

@@ -178,13 +178,14 @@ class Shapes(NamedTuple):
     colours: Colours | None = None
 
 
-def _finite(values: Floats, axes: int | tuple[int, ...]) -> NDArray[np.bool_]:
+def finite(values: Floats, axes: int | tuple[int, ...]) -> NDArray[np.bool_]:
+    """Where everything along some axes is finite."""
     return np.asarray(np.isfinite(values).all(axis=axes), np.bool_)
 
 
 def shapes(points: Floats, extents: Floats, colours: Colours | None = None) -> Shapes:
     """Flatten shapes [n, F, 2] and leave out those with NaN."""
-    seen = _finite(points + extents, 2)
+    seen = finite(points + extents, 2)
     chosen = None if colours is None else colours[seen]
     return Shapes(seen.sum(axis=1), points[seen], extents[seen], chosen)
 
@@ -229,7 +230,7 @@ def ellipses(covariance: Floats, *, sigmas: float = 3.0) -> tuple[Floats, Floats
 
     NaN where the covariance is not finite.
     """
-    good = _finite(covariance[:, :2, :2], (1, 2))
+    good = finite(covariance[:, :2, :2], (1, 2))
     values, vectors = np.linalg.eigh(np.where(good[:, None, None], covariance[:, :2, :2], 0.0))
     half = np.where(good[:, None], sigmas * np.sqrt(np.maximum(values, 0)), np.nan)
     return half, np.arctan2(vectors[:, 1, 0], vectors[:, 0, 0])
@@ -255,19 +256,19 @@ def numbers(table: Columns) -> list[str]:
     return [form % tuple(row) for row in values.tolist()]
 
 
-def _table_form(title: str, names: str, formats: str) -> tuple[str, str]:
+def table_form(title: str, names: str, formats: str) -> tuple[str, str]:
     """Head and line of a Markdown table."""
     heads, cells = names.split(), formats.split()
     head = f"**{title}**\n\n| {' | '.join(heads)} |\n|{'---:|' * len(heads)}\n"
     return head, f"| {' | '.join(cells)} |\n"
 
 
-_MATRICES = _table_form(
+_MATRICES = table_form(
     "Covariance of the pose (x, y m; α rad) and of the motion (u, v px; α rad)", "P·x P·y P·α M·u M·v M·α", "%.2e " * 6
 )
-_QUALITY = _table_form("Fragments", "# peak ratio rms condition weight", "%.0f %.4f %.3f %.2f %.2f %.2f")
-_SHIFTS = _table_form("Shifts, px", "# u v Δu Δv fit·u fit·v", "%.0f" + " %.3f" * 6)
-_HESSIANS = _table_form("Hessians, grey²/px²", "# uu uv vv", "%.0f" + " %.4g" * 3)
+_QUALITY = table_form("Fragments", "# peak ratio rms condition weight", "%.0f %.4f %.3f %.2f %.2f %.2f")
+_SHIFTS = table_form("Shifts, px", "# u v Δu Δv fit·u fit·v", "%.0f" + " %.3f" * 6)
+_HESSIANS = table_form("Hessians, grey²/px²", "# uu uv vv", "%.0f" + " %.4g" * 3)
 
 
 # ---------------------------------------------------------------------------- verdicts

@@ -99,7 +99,9 @@ class Scenario(Section):
     height: AnyHeight | None = Field(None, description="distance sensor beside the downward camera")
     imu: AnyImu | None = Field(None, description="inertial measurement unit")
     odometer: AnyOdometer | None = Field(None, description="wheel odometer")
-    reference: AnyReference | None = Field(None, description="reference pose, at the first camera plus its point_m")
+    reference: AnyReference | None = Field(
+        None, description="reference pose: at the downward camera, or at the body where there is none, plus its point_m"
+    )
     gnss: AnyGnss | None = Field(None, description="satellite receiver")
     truth: Clock | None = Field(None, description="exact pose and velocity of the turning point")
     faults: tuple[AnyFault, ...] = Field((), description="what goes wrong, and when")
@@ -495,8 +497,8 @@ def _single_precision(channel: Channel) -> Channel:
 
 
 def _at_camera(reference: Reference, scenario: Scenario) -> Reference:
-    """The reference, its point counted from the first camera where there is one, whose frame is not the body's."""
-    section = scenario.first_camera
+    """The reference, its point counted from the downward camera where there is one, whose frame is not the body's."""
+    section = scenario.camera
     if section is None:
         return reference
     x, y, z = reference.point_m

@@ -9,6 +9,7 @@ import zipfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -169,11 +170,11 @@ class _Noted:
         self._log, self._notes = log, notes
         self.event, self.errors, self.finish, self.close = log.event, log.errors, log.finish, log.close
 
-    def step(self, step: Step) -> None:
+    def step(self, step: Step, beside: Any = None) -> None:
         """Note and log a step."""
         assert isinstance(step, CorrelationStep)
         self._notes.add(step)
-        self._log.step(step)
+        self._log.step(step, beside)
 
 
 def _file(cell: Cell, folder: Path) -> Path:

@@ -1,0 +1,246 @@
+"""A replay of ranges: which streams it takes, what it fills in, how it judges, and the whole of it."""
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import fake_ranges
+import numpy as np
+import pytest
+
+from pipelines.lens import project
+from pipelines.ranging.landmarks.settings import LandmarkKind
+from pipelines.ranging.range_settings import RangeSettings
+from pipelines.ranging.reference import PoseTrack, ReferenceRanges
+from pipelines.ranging.step import RangeStep
+from pipelines.replay import Frame
+from readers.streams import Camera, Recording, StreamError, StreamKind, TrackSample
+from tests.toys import ToyRecording
+from workbench import range_inputs, rrd
+from workbench.cli import main
+from workbench.range_account import RangeAccount
+from workbench.range_traces import RangeScene
+from workbench.scenarios import load, mission
+from workbench.session import Request, run
+from workbench.settings import Resolved
+from workbench.summary import Tally, lines, range_suitability
+
+TRACKS, ODOMETRY, IMU = "/front/tracks", "/wheel/odometry", "/imu"
+EVERYTHING = {
+    TRACKS: StreamKind.TRACK,
+    "/front/image_raw": StreamKind.IMAGE,
+    ODOMETRY: StreamKind.ODOMETRY,
+    "/truth/odometry": StreamKind.ODOMETRY,
+    IMU: StreamKind.IMU,
+}
+
+
+class Kinds(ToyRecording):
+    """A recording that has streams of some kinds, one message each."""
+
+    def __init__(self, kinds: dict[str, StreamKind], cameras: dict[str, Camera] | None = None) -> None:
+        super().__init__([TrackSample(stream=name, t_ns=0, received_ns=0, ids=np.zeros(0, np.int64),
+                                      points_px=np.zeros((0, 2))) for name in kinds], kinds)  # fmt: skip
+        self._cameras = cameras or {}
+
+    @property
+    def cameras(self) -> dict[str, Camera]:
+        return self._cameras
+
+
+def chosen(kinds: dict[str, StreamKind], settings: RangeSettings | None = None, **named: str) -> range_inputs.Streams:
+    return range_inputs.choose_streams(Kinds(kinds), settings or RangeSettings(), **named)
+
+
+# ------------------------------------------------------------------------------------- streams
+
+
+def test_tracks_come_before_images_which_are_then_shown() -> None:
+    streams = chosen(EVERYTHING)
+    assert (streams.frames, streams.shown) == (TRACKS, "/front/image_raw")
+    assert streams.others == (ODOMETRY, IMU)
+    assert chosen(EVERYTHING, image="none").shown == ""
+    assert chosen(EVERYTHING, imu="none").others == (ODOMETRY,)
+    assert chosen(EVERYTHING, odometry="/truth/odometry").odometry == "/truth/odometry"
+
+
+def test_settings_say_what_the_frames_are() -> None:
+    corners = RangeSettings(landmarks=LandmarkKind.CORNERS)
+    assert chosen(EVERYTHING, corners).frames == "/front/image_raw"
+    assert chosen(EVERYTHING, corners).shown == ""
+    with pytest.raises(StreamError, match=r"no stream of landmarks for landmarks = 'bearings'"):
+        chosen(EVERYTHING, RangeSettings(landmarks=LandmarkKind.BEARINGS))
+
+
+def test_what_cannot_be_chosen_is_named_with_the_cure() -> None:
+    two = EVERYTHING | {"/rear/tracks": StreamKind.TRACK}
+    with pytest.raises(StreamError, match=r"several track streams: /front/tracks, /rear/tracks; choose .*--tracks"):
+        chosen(two)
+    assert chosen(two, tracks="/rear/tracks").frames == "/rear/tracks"
+    with pytest.raises(StreamError, match=r"several odometry streams.*--odometry"):
+        chosen(EVERYTHING | {"/visual/odometry": StreamKind.ODOMETRY})
+    with pytest.raises(StreamError, match=r"several IMU streams.*--imu"):
+        chosen(EVERYTHING | {"/imu2": StreamKind.IMU})
+    with pytest.raises(StreamError, match="no odometry, and ranges come from known speeds alone"):
+        chosen({TRACKS: StreamKind.TRACK, IMU: StreamKind.IMU})
+    with pytest.raises(StreamError, match="holds imu; --tracks can be: /front/tracks"):
+        chosen(EVERYTHING, tracks=IMU)
+
+
+def test_the_camera_is_filled_in_where_the_settings_leave_it_open() -> None:
+    made = mission(load("sim:paper-b"))
+    streams = range_inputs.choose_streams(made, RangeSettings())
+    camera = range_inputs.camera_of(made, streams)
+    filled, _ = range_inputs.with_camera(Resolved(RangeSettings(), frozenset()), made, camera, streams)
+    s: Any = filled.settings
+    assert (s.focal_px, s.centre_px, s.image_size_px) == (500.0, (319.5, 239.5), (640, 480))
+    np.testing.assert_allclose(s.body_r_camera, [[0, 0, 1], [-1, 0, 0], [0, -1, 0]], atol=1e-12)
+    given = Resolved(RangeSettings(focal_px=400.0, camera_pitch_rad=0.1), frozenset({"focal_px", "camera_pitch_rad"}))
+    kept: Any = range_inputs.with_camera(given, made, camera, streams)[0].settings
+    assert (kept.focal_px, kept.centre_px, kept.camera_quat_xyzw) == (400.0, None, None)
+
+
+def test_no_camera_is_an_error_that_says_what_to_give() -> None:
+    recording: Recording = Kinds(EVERYTHING)
+    streams = range_inputs.choose_streams(recording, RangeSettings())
+    with pytest.raises(StreamError, match=r"no calibration of the camera of /front/tracks: give --set focal_px"):
+        range_inputs.with_camera(Resolved(RangeSettings(), frozenset()), recording, None, streams)
+
+
+# ---------------------------------------------------------------------- landmarks of a mission
+
+
+def test_landmarks_and_camera_of_a_mission_are_where_its_tracks_say() -> None:
+    made = mission(load("sim:paper-b", overrides=["tracks.noise_px=0"]))
+    camera, poses = made.cameras["/front/image_raw"], PoseTrack()
+    for pose in made.read(["/reference/pose"]):
+        poses.add(pose.t_ns, pose.position_m, pose.quat_xyzw)  # type: ignore[attr-defined]
+    tracks = [sample for sample in made.read([TRACKS]) if isinstance(sample, TrackSample)]
+    for sample in (tracks[0], tracks[40], tracks[100]):
+        camera_t_world = np.linalg.inv(poses.at(sample.t_ns) @ camera.body_t_camera)
+        places = np.array([[*made.landmarks[number].position_m, 1.0] for number in sample.ids.tolist()])
+        seen = project(camera, (places @ camera_t_world.T)[:, :3])
+        np.testing.assert_allclose(sample.points_px, seen, atol=1e-3)
+
+
+def test_a_written_mission_carries_its_landmarks(tmp_path: Path) -> None:
+    assert main(["simulate", "paper-b", "-o", str(tmp_path / "b.mcap"), "--set", "duration_s=0.4",
+                 "--set", "front.width_px=64", "--set", "front.height_px=48"]) == 0  # fmt: skip
+    from readers import open_recording
+
+    with open_recording(tmp_path / "b.mcap") as written:
+        found = range_inputs.landmarks_of(written)
+    made = mission(load("sim:paper-b")).landmarks
+    assert found.keys() == made.keys()
+    for number, landmark in made.items():
+        np.testing.assert_array_equal(found[number].position_m, landmark.position_m)
+
+
+# ------------------------------------------------------------------------------------- account
+
+
+class Silent:
+    """A log that nothing is told."""
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda *args, **options: None
+
+
+def account_of(steps: list[RangeStep], sigma: float = 1.0) -> dict[str, Any]:
+    """The account of steps whose ξ are off the truth by `sigma` σ."""
+    ranges = ReferenceRanges(None)
+    account = RangeAccount(RangeScene(), ranges, PoseTrack(), np.eye(4), "truth")
+    tally = Tally()
+    for step in steps:
+        depth = 1 / (step.mean[:, 2] - sigma * np.sqrt(step.covariance[:, 2, 2]))
+        known = {n: (d, d) for n, d in zip(step.landmark_id.tolist(), depth.tolist(), strict=True) if n == n}
+        ranges._measured[step.t_ns] = {int(n): d for n, d in known.items()}
+        frame: Frame = TrackSample(
+            stream="/t", t_ns=step.t_ns, received_ns=0, ids=np.zeros(0, np.int64), points_px=np.zeros((0, 2))
+        )
+        account.take(step, frame)
+        tally.add(step.verdict, step.alarms, True)
+    found, aligned = account.conclude(Silent(), tally, 0.1)
+    assert aligned is None
+    return found
+
+
+def test_errors_consistency_and_waits_are_what_they_were_made() -> None:
+    steps = list(fake_ranges.steps(80, slots=6, count=4))
+    found = account_of(steps, 1.0)["ranging"]
+    assert found["error"]["nees"] == pytest.approx(1.0)
+    assert found["error"]["coverage"] == 1.0
+    assert found["landmarks"] == found["converged_landmarks"] == 4
+    told = [step.status[0] == 2 for step in steps]
+    one = found["per_landmark"][0]
+    assert one["time_to_converge_s"] == pytest.approx(0.1 * told.index(True))
+    assert one["converged_share"] == pytest.approx(sum(told) / len(told))
+    expected = [
+        abs(1 / (s.mean[0, 2] * (1 / (s.mean[0, 2] - np.sqrt(s.covariance[0, 2, 2])))) - 1)
+        for s, counts in zip(steps, told, strict=True) if counts
+    ]  # fmt: skip
+    assert one["error"]["median_percent"] == pytest.approx(100 * float(np.median(expected)))
+    nis = np.array([step.nis for step in steps]).clip(max=13.8)  # a blunder counts as the gate
+    assert found["nis"]["mean"] == pytest.approx(float(np.nanmean(nis)))
+    assert found["nis"]["low"] < 2 < found["nis"]["high"]
+    assert account_of(steps, 3.0)["ranging"]["error"]["coverage"] == 0.0
+
+
+def test_uncertainties_that_do_not_hold_are_not_to_be_trusted() -> None:
+    steps = list(fake_ranges.steps(80, slots=6, count=3))
+    good, bad = account_of(steps, 1.0), account_of(steps, 3.0)
+    assert not good["suitability"][0].startswith("do not trust")
+    assert bad["suitability"][0].startswith("do not trust the uncertainties")
+    assert "NEES 9 of the inverse depth where 1 is expected, 0 % within 2σ" in bad["suitability"][1]
+    loud = account_of([dataclasses.replace(step, nis=3 * step.nis) for step in steps])
+    assert "the innovations are larger than the filter's noise settings say" in loud["suitability"][1]
+    assert range_suitability(Tally(), {"landmarks": 0}) == ["do not trust: no landmark was ever found"]
+
+
+# --------------------------------------------------------------------------------- all of it
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The run folder of the first ten seconds of paper B's robot, its images left out."""
+    out = tmp_path_factory.mktemp("runs")
+    (out / "best.tum").write_text("of an earlier run")
+    request = Request(path=Path("sim:paper-b"), estimator="range", stop="10", image="none", out=out)
+    outcome = run(request)
+    (out / "summary.json").write_text(json.dumps(outcome.summary, default=str))
+    return out
+
+
+def test_a_mission_is_replayed_with_honest_ranges(folder: Path) -> None:
+    summary = json.loads((folder / "summary.json").read_text())
+    assert summary["frames"] == 50
+    assert summary["image_stream"] == TRACKS
+    ranging = summary["ranging"]
+    assert ranging["converged_landmarks"] >= 20
+    assert ranging["nis"]["low"] - 0.2 < ranging["nis"]["mean"] < ranging["nis"]["high"] + 0.2
+    assert ranging["error"]["median_percent"] < 5
+    assert ranging["error"]["coverage"] > 0.85
+    assert not summary["suitability"][0].startswith("do not trust")
+    assert not (folder / "best.tum").exists()
+    rows = [name for name, _ in lines(summary)]
+    assert {"landmarks", "converged", "NIS", "range error", "landmark"} <= set(rows)
+    assert "path length" not in rows
+
+
+def test_the_log_of_a_replay_reads_back(folder: Path) -> None:
+    fields = rrd.read_fields(folder / "best.rrd", "best", RangeStep, ["frame", "range_m", "landmarks"])
+    assert fields["frame"] == list(range(50))
+    assert int(fields["landmarks"][-1]) == np.isfinite(fields["range_m"][-1]).sum()
+
+
+def test_errors_are_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
+    out = ["-o", str(tmp_path / "out")]
+    assert main(["replay", "sim:paper-b", "-e", "range", "--calibrate", *out]) == 2
+    assert main(["replay", "sim:figure-eight", "-e", "range", *out]) == 2
+    problems = capsys.readouterr().err.strip().splitlines()
+    assert len(problems) == 2
+    assert "--calibrate is for estimators of a path" in problems[0]
+    assert "no odometry" in problems[1]
+    assert main(["settings", "-e", "range"]) == 0
+    assert "max_landmarks" in capsys.readouterr().out
