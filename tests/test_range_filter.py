@@ -20,6 +20,7 @@ from pipelines.ranging import equations as eq
 from pipelines.ranging import montecarlo as mc
 from pipelines.ranging.filter import Outcome, Status
 from pipelines.ranging.inputs import Synchronisation
+from pipelines.ranging.landmarks.settings import TrackSettings
 from pipelines.ranging.range_filter import RangeFilter
 from pipelines.ranging.range_settings import MotionModel, RangeSettings
 from pipelines.ranging.reference import measured, surveyed
@@ -355,6 +356,8 @@ def test_papers_robot_before_a_chessboard() -> None:
         centre_px=(camera.matrix[0, 2], camera.matrix[1, 2]),
         camera_position_m=tuple(mount.position_m),
         max_landmarks=50,
+        sigma_speed=scenario.odometer.speed_density,
+        tracks=TrackSettings(sigma_px=scenario.tracks.noise_px),
     )
     names = ["/imu", "/wheel/odometry", "/front/tracks"]
     found = {}
