@@ -164,7 +164,8 @@ def _range_doubts(ranging: Mapping[str, Any]) -> list[str]:
         )
     elif error["nees"] < 1 / (2 * NEES_APART):
         doubts.append(
-            f"NEES {error['nees']:.3g} of the inverse depth where 1 is expected: the ranges are better than the filter says"
+            f"NEES {error['nees']:.3g} of the inverse depth where 1 is expected: the ranges are better than the filter "
+            "says"
         )
     return doubts
 
@@ -349,7 +350,7 @@ def _range_lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         ),
         (
             "NIS",
-            f"mean {nis['mean']:.3g} of those below 13.8; {nis['expected']:.0f} expected, "
+            f"mean {nis['mean']:.3g} (each at most 13.8); {nis['expected']:.0f} expected, "
             f"within {nis['low']:.3g}…{nis['high']:.3g} at 95 %",
         ),
         ("reference", summary["reference"]),
