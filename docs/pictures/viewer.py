@@ -1,7 +1,8 @@
 """Take `viewer.png` and `failure.png`, or `range.png`: results in the viewer, without its title bar.
 
     workbench demo && python docs/pictures/viewer.py results/demo
-    workbench replay sim:paper-b -e range -o results/ranges && python docs/pictures/viewer.py results/ranges --of range
+    workbench replay sim:paper-b -e range --set tracks.sigma_px=0.1 --set sigma_speed=0.002 -o results/ranges
+    python docs/pictures/viewer.py results/ranges --of range
 
 It needs a graphics driver, of software will do (Debian: mesa-vulkan-drivers).
 """
