@@ -48,8 +48,9 @@ ADVICE: Mapping[Verdict, str] = {
     Verdict.LANDMARK_RESET: "tracks slip from one point to another, or the motion is not that of the inputs",
     Verdict.NO_LANDMARKS: "nothing is tracked there",
     Verdict.PURE_ROTATION: "the robot turns on the spot: drive to get ranges",
-    Verdict.NIS_HIGH: "raise pixel_sigma, sigma_omega or sigma_speed, and check stamps, calibration and mounting",
-    Verdict.NIS_LOW: "lower pixel_sigma, sigma_omega or sigma_speed",
+    Verdict.NIS_HIGH: "raise the noise of the image points (tracks.sigma_px and the like), sigma_omega or "
+    "sigma_speed, and check stamps, calibration and mounting",
+    Verdict.NIS_LOW: "lower the noise of the image points (tracks.sigma_px and the like), sigma_omega or sigma_speed",
     Verdict.INNOVATIONS_ONE_SIDED: "the start is wrong: a broad start finds the range by itself",
     Verdict.INNOVATIONS_ALTERNATE: "frames or stamps are swapped",
     Verdict.INNOVATIONS_FOLLOW_TURN: "images come with late or early stamps: shift them",
@@ -162,7 +163,10 @@ def _range_doubts(ranging: Mapping[str, Any]) -> list[str]:
             "2σ where 95 % are: the ranges are worse than the filter says"
         )
     elif error["nees"] < 1 / (2 * NEES_APART):
-        doubts.append(f"NEES {error['nees']:.3g} where 1 is expected: the ranges are better than the filter says")
+        doubts.append(
+            f"NEES {error['nees']:.3g} of the inverse depth where 1 is expected: the ranges are better than the filter "
+            "says"
+        )
     return doubts
 
 
@@ -339,12 +343,15 @@ def _range_lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     wait = "" if math.isnan(found["time_to_converge_s"]) else f" after {found['time_to_converge_s']:.3g} s (median)"
     counts = f"{found['updates']} updates, {found['rejected']} rejected, {found['resets']} resets, {found['lost']} lost"
     rows = [
-        ("landmarks", f"{found['landmarks']} in {found['starts']} starts; {counts}"),
-        ("converged", f"{found['converged_landmarks']} landmarks{wait}; {percent(found['converged_share'])} of ranges"),
+        ("landmarks", f"{found['landmarks']}, started {found['starts']} times; {counts}"),
+        (
+            "converged",
+            f"{found['converged_landmarks']} landmarks{wait}; {percent(found['converged_share'])} of all ranges",
+        ),
         (
             "NIS",
-            f"mean {nis['mean']:.3g}, none counted above 13.8; {nis['expected']:.0f} expected, "
-            f"95 % in {nis['low']:.3g}…{nis['high']:.3g}",
+            f"mean {nis['mean']:.3g} (each at most 13.8); {nis['expected']:.0f} expected, "
+            f"within {nis['low']:.3g}…{nis['high']:.3g} at 95 %",
         ),
         ("reference", summary["reference"]),
     ]
@@ -353,7 +360,7 @@ def _range_lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     shown = found["per_landmark"][:MOST_LANDMARKS]
     rows += [("landmark", _one_landmark(one)) for one in shown]
     if len(found["per_landmark"]) > len(shown):
-        rows.append(("landmark", f"{len(found['per_landmark']) - len(shown)} more; --json has them all"))
+        rows.append(("landmark", f"{len(found['per_landmark']) - len(shown)} more; --json prints all"))
     return rows
 
 
@@ -364,7 +371,8 @@ def _one_landmark(one: Mapping[str, Any]) -> str:
     starts = f", {one['starts']} starts" if one["starts"] > 1 else ""
     error = "" if one["error"] is None else f"; {_range_error(one['error'])}"
     rejected = f", {one['rejected']} rejected" if one["rejected"] else ""
-    return f"{one['landmark']}: {wait}{starts}{error}; NIS {one['nis']:.3g} of {one['updates']} updates{rejected}"
+    nis = f"NIS {one['nis']:.3g} of {one['updates']} updates" if one["updates"] else "no update"
+    return f"{one['landmark']}: {wait}{starts}{error}; {nis}{rejected}"
 
 
 def _range_error(error: Mapping[str, float]) -> str:

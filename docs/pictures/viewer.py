@@ -1,6 +1,8 @@
-"""Take `viewer.png` and `failure.png`: the result of `workbench demo` in the viewer, without its title bar.
+"""Take `viewer.png` and `failure.png`, or `range.png`: results in the viewer, without its title bar.
 
     workbench demo && python docs/pictures/viewer.py results/demo
+    workbench replay sim:paper-b -e range --set tracks.sigma_px=0.1 --set sigma_speed=0.002 -o results/ranges
+    python docs/pictures/viewer.py results/ranges --of range
 
 It needs a graphics driver, of software will do (Debian: mesa-vulkan-drivers).
 """
@@ -22,8 +24,11 @@ from rerun.experimental import ViewerClient
 FOLDER = Path(__file__).parent
 WIDTH_PX, HEIGHT_PX, TITLE_PX = 1600, 1000, 36
 PATIENCE_S, SETTLE_S = 120.0, 2.0
-SHOTS = (("viewer.png", "best", 205, None), ("failure.png", "paper-a", 198, "Errors"))
-"""File, run, frame, and the tab to bring to the front."""
+SHOTS = {
+    "demo": (("viewer.png", "best", 205, None), ("failure.png", "paper-a", 198, "Errors")),
+    "range": (("range.png", "best", 24, None),),
+}
+"""By what the results are of: file, run, frame, and the tab to bring to the front."""
 
 
 def shoot(files: list[Path], frame: int, tab: str | None, target: Path) -> None:
@@ -86,11 +91,13 @@ def _bring_to_front(client: ViewerClient, tab: str) -> None:
 
 
 def main() -> None:
-    """Take both pictures."""
+    """Take the pictures of one folder of results."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("results", type=Path, help="folder of the results of `workbench demo`")
-    results = parser.parse_args().results.resolve()
-    for file, run, frame, tab in SHOTS:
+    parser.add_argument("results", type=Path, help="folder of the results")
+    parser.add_argument("--of", choices=SHOTS, default="demo", help="what they are the results of")
+    arguments = parser.parse_args()
+    results = arguments.results.resolve()
+    for file, run, frame, tab in SHOTS[arguments.of]:
         shoot([results / "sensors.rrd", results / f"{run}.rrd"], frame, tab, FOLDER / file)
 
 
