@@ -207,7 +207,15 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
     out = tmp_path_factory.mktemp("runs")
     (out / "best.tum").write_text("of an earlier run")
     noise = ("sigma_speed=0.002", "tracks.sigma_px=0.1")  # that of the scenario
-    request = Request(path=Path("sim:paper-b"), estimator="range", overrides=noise, stop="10", image="none", out=out)
+    request = Request(
+        path=Path("sim:paper-b"),
+        estimator="range",
+        overrides=noise,
+        stop="10",
+        image="none",
+        out=out,
+        calibrate=True,
+    )
     outcome = run(request)
     (out / "summary.json").write_text(json.dumps(outcome.summary, default=str))
     return out
@@ -229,6 +237,15 @@ def test_a_mission_is_replayed_with_honest_ranges(folder: Path) -> None:
     assert "path length" not in rows
 
 
+def test_a_replay_tells_of_its_sensors(folder: Path) -> None:
+    summary = json.loads((folder / "summary.json").read_text())
+    told = summary["calibration"]
+    assert told["key"].startswith("focus") or "gyro_bias, focus" in told["key"]
+    off = (np.array(told["focus"]["focus_px"]) - [319.5, 239.5]) / told["focus"]["sigma_px"]
+    assert np.abs(off).max() < 3
+    assert [text for name, text in lines(summary) if name == "calibration"] == told["sentences"]
+
+
 def test_the_log_of_a_replay_reads_back(folder: Path) -> None:
     fields = rrd.read_fields(folder / "best.rrd", "best", RangeStep, ["frame", "range_m", "landmarks"])
     assert fields["frame"] == list(range(50))
@@ -237,11 +254,9 @@ def test_the_log_of_a_replay_reads_back(folder: Path) -> None:
 
 def test_errors_are_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path) -> None:
     out = ["-o", str(tmp_path / "out")]
-    assert main(["replay", "sim:paper-b", "-e", "range", "--calibrate", *out]) == 2
     assert main(["replay", "sim:figure-eight", "-e", "range", *out]) == 2
     problems = capsys.readouterr().err.strip().splitlines()
-    assert len(problems) == 2
-    assert "--calibrate is for estimators of a path" in problems[0]
-    assert "no odometry" in problems[1]
+    assert len(problems) == 1
+    assert "no odometry" in problems[0]
     assert main(["settings", "-e", "range"]) == 0
     assert "max_landmarks" in capsys.readouterr().out

@@ -278,7 +278,11 @@ def replay(
         str | None, typer.Option(metavar="TOPIC", help="Range, number or pose (z) stream of the camera's height.")
     ] = None,
     calibrate: Annotated[
-        bool, typer.Option("--calibrate", help="Tell the scale and mounting yaw that fit the reference.")
+        bool,
+        typer.Option(
+            "--calibrate",
+            help="Tell the scale and mounting yaw that fit; with -e range: gyro bias, focus, delay.",
+        ),
     ] = False,
     raw_images: Annotated[str, typer.Option(metavar="FORM", help="Keep raw images as png or raw.")] = "png",
     rate: Rate = None,

@@ -24,6 +24,7 @@ from pipelines.ranging.reference import PoseTrack, ReferenceRanges
 from pipelines.ranging.step import RangeStep
 from readers.streams import Camera, Landmark, StreamKind
 from workbench.inputs import Reference
+from workbench.range_calibration import SensorCalibration
 from workbench.range_traces import GATE, Beside, RangeScene
 from workbench.settings import Resolved
 from workbench.summary import Tally, range_suitability
@@ -79,6 +80,7 @@ class RangeAccount:
         sentence: what the reference is.
         offset_ns: added to the frames' times to find the reference.
         degrees: of freedom of an image point.
+        sensors: collects what tells of the sensors; None where nobody asked.
     """
 
     trajectory = False
@@ -92,10 +94,12 @@ class RangeAccount:
         sentence: str,
         offset_ns: int = 0,
         degrees: int = 2,
+        sensors: SensorCalibration | None = None,
     ) -> None:
         self.scene = scene
         self._ranges, self._poses, self._body_t_camera = ranges, poses, body_t_camera
         self._sentence, self._offset_ns, self._degrees = sentence, offset_ns, degrees
+        self._sensors = sensors
         self._lives: dict[int, Life] = {}
         self._carried = self._measured = self._converged = 0
 
@@ -107,6 +111,8 @@ class RangeAccount:
         reference: Reference,
         streams: Streams,
         offset_ns: int,
+        *,
+        calibrate: bool = False,
     ) -> RangeAccount:
         """The account of a replay with these settings and this reference."""
         settings: Any = resolved.settings
@@ -138,7 +144,8 @@ class RangeAccount:
         if own is not None and not undistorted(own):
             scene = dataclasses.replace(scene, on_image=lambda points: _seen(own, points))
         sentence = _sentence(reference, landmarks, bearings, board is not None)
-        return cls(scene, ranges, poses, body_t_camera, sentence, offset_ns, 1 if bearings else 2)
+        sensors = SensorCalibration(settings, bool(streams.imu)) if calibrate else None
+        return cls(scene, ranges, poses, body_t_camera, sentence, offset_ns, 1 if bearings else 2, sensors)
 
     # ---- step by step
 
@@ -146,6 +153,8 @@ class RangeAccount:
         """Follow the landmarks of one step; what the reference says of its frame."""
         assert isinstance(step, RangeStep)
         self._ranges.take(sample)
+        if self._sensors is not None:
+            self._sensors.take(step)
         ids = np.nan_to_num(step.landmark_id, nan=-1).astype(np.int64)
         depth = self._ranges.at(step.t_ns + self._offset_ns, ids).depth_m
         depth = np.where(depth > 0, depth, np.nan)
@@ -207,7 +216,7 @@ class RangeAccount:
             "reference": self._sentence if ranging["error"] else self._without(),
             "ranging": ranging,
             "evaluation": None,
-            "calibration": None,
+            "calibration": None if self._sensors is None else self._sensors.told(),
             "suitability": range_suitability(tally, ranging),
         }, None
 

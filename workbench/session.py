@@ -331,8 +331,6 @@ def _choose_for_path(request: Request, recording: Recording, resolved: Resolved)
 
 def _choose_for_ranges(request: Request, recording: Recording, resolved: Resolved) -> _Chosen:
     """The choices of an estimator of ranges to landmarks: frames, odometry, IMU, camera."""
-    if request.calibrate:
-        raise SettingsError("--calibrate is for estimators of a path; this one estimates ranges")
     streams = range_inputs.choose_streams(
         recording,
         resolved.settings,
@@ -348,7 +346,7 @@ def _choose_for_ranges(request: Request, recording: Recording, resolved: Resolve
     camera = range_inputs.camera_of(recording, streams)
     resolved, notes = range_inputs.with_camera(resolved, recording, camera, streams)
     landmarks = range_inputs.landmarks_of(recording)
-    account = RangeAccount.of(resolved, landmarks, reference, streams, offset_ns)
+    account = RangeAccount.of(resolved, landmarks, reference, streams, offset_ns, calibrate=request.calibrate)
     return _Chosen(
         frames=streams.frames,
         others=streams.others,

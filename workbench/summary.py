@@ -298,7 +298,8 @@ def lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         rows += [("path length", f"{summary['path_length']:.4g} {summary['unit']}"), ("scale", summary["scale"])]
     rows += _range_lines(summary) if "ranging" in summary else _evaluation_lines(summary)
     if summary.get("calibration"):
-        rows.append(("calibration", summary["calibration"]["sentence"]))
+        told = summary["calibration"]
+        rows += [("calibration", text) for text in told.get("sentences", [told["sentence"]])]
     for key, title in (("suitability", "suitability"), ("notes", "note"), ("damage", "damage"), ("facts", "fact")):
         rows += [(title, text) for text in summary[key]]
     if summary["interrupted"]:
