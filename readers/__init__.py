@@ -23,7 +23,7 @@ __all__ = ["ReadOptions", "Recording", "RecordingError", "open_recording"]
 
 PLUGIN_GROUP = "estimator_workbench.readers"
 MCAP, ROS1, SQLITE, ZSTD = b"\x89MCAP0\r\n", b"#ROSBAG V2.0\n", b"SQLite format 3\0", b"\x28\xb5\x2f\xfd"
-MATLAB = b"MATLAB 5.0 MAT"
+MATLAB = b"MATLAB "
 STORAGE_SUFFIXES = (".db3", ".mcap", ".db3.zstd", ".mcap.zstd")
 REFUSED = {
     b"#ROSRECORD": ("it is a ROS bag of a format older than 2.0", "rewrite it with ROS 1's `rosbag fix`"),

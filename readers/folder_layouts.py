@@ -47,7 +47,7 @@ def open_layout(root: Path, options: ReadOptions) -> FolderRecording | None:
     """Open a folder by the first layout that knows it, None if none does."""
     from readers.landmark_tables import landmark_table, mrclam
 
-    layouts = (euroc, tum_rgbd, kitti, surface_set, mocap_table, gnss_table, mrclam, landmark_table, plain_frames)
+    layouts = (euroc, tum_rgbd, kitti, surface_set, mocap_table, gnss_table, mrclam, plain_frames, landmark_table)
     for layout in layouts:
         draft = layout(root, options)
         if draft is not None:

@@ -3,13 +3,14 @@
 import itertools
 from pathlib import Path
 
+import cv2
 import numpy as np
 import pytest
 import scipy.io
 from recordings_dir import RECORDINGS
 from scipy.spatial.transform import Rotation
 
-from readers import open_recording
+from readers import ReadOptions, open_recording
 from readers.streams import LandmarkSample, OdometrySample, PoseSample, Recording, RecordingError, TrackSample
 
 STARRY = RECORDINGS / "_no_licence_stated" / "starry_night_stereo_landmarks"
@@ -130,6 +131,19 @@ def test_tables_of_another_layout_are_refused(tmp_path: Path) -> None:
     scipy.io.savemat(tmp_path / "other.mat", {"depth": np.ones((2, 2))})
     with pytest.raises(RecordingError, match=r"other\.mat.*t is missing or misshapen.*variables are depth"):
         open_recording(tmp_path / "other.mat")
+    head = b"MATLAB 7.3 MAT-file, Platform: GLNXA64".ljust(124) + (0x0200).to_bytes(2, "little") + b"IM"
+    (tmp_path / "new.mat").write_bytes(head + bytes(600))
+    with pytest.raises(RecordingError, match=r"new\.mat: it is a MATLAB 7\.3 table \(HDF5\); save it with -v7"):
+        open_recording(tmp_path / "new.mat")
     (tmp_path / "torn.mat").write_bytes(next(STARRY.glob("*.mat")).read_bytes()[:5000])
     with pytest.raises(RecordingError, match=r"torn\.mat.*file is complete"):
         open_recording(tmp_path / "torn.mat")
+
+
+def test_a_table_beside_images_leaves_them_a_folder_of_images(tmp_path: Path) -> None:
+    scipy.io.savemat(tmp_path / "calibration.mat", {"K": np.eye(3)})
+    for k in range(2):
+        cv2.imwrite(str(tmp_path / f"{k}.png"), np.zeros((4, 6), np.uint8))
+    recording = open_recording(tmp_path, ReadOptions(rate_hz=10.0))
+    assert recording.format.startswith("image folder")
+    assert [info.count for info in recording.streams] == [2]
