@@ -8,9 +8,11 @@ variance after T is σ²·T.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 
 import numpy as np
+import scipy.signal
 from numpy.typing import NDArray
 
 Floats = NDArray[np.float64]
@@ -62,3 +64,14 @@ def in_ticks(rng: np.random.Generator, speeds: Floats, tick: float, rate_hz: flo
     """
     way = rng.random(speeds.shape[1:]) + np.cumsum(speeds, axis=0) / (rate_hz * tick)
     return np.asarray(np.diff(np.floor(way), axis=0, prepend=0.0) * tick * rate_hz)
+
+
+def correlated(n: int, tau: float, rng: np.random.Generator) -> Floats:
+    """Gaussian noise [n] of unit variance whose correlation falls to 1/e in `tau` samples: AR(1).
+
+    x_k = a x_{k-1} + sqrt(1 - a²) w_k with a = exp(-1/τ), x_0 = w_0.
+    """
+    memory = math.exp(-1 / tau)
+    shocks = rng.standard_normal(n)
+    shocks[1:] *= math.sqrt(1 - memory**2)
+    return np.asarray(scipy.signal.lfilter([1.0], [1.0, -memory], shocks))

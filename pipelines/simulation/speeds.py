@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from pipelines.simulation.channels import rng_of
 from pipelines.simulation.curves import made
+from pipelines.simulation.noise import correlated
 from pipelines.simulation.signals import rising_knots
 
 Floats = NDArray[np.float64]
@@ -261,13 +262,7 @@ def jittery_speed(
     n_frames: int, speed_mps: float, rng: np.random.Generator, *, share: float = 0.10, tau_frames: float = 14.0
 ) -> Floats:
     """Speed [n_frames] with AR(1) jitter of standard deviation `share`: slow driving (2 km/h)."""
-    memory = math.exp(-1 / tau_frames)
-    shocks = rng.standard_normal(n_frames)
-    jitter = np.empty(n_frames)
-    jitter[0] = shocks[0]
-    for k in range(1, n_frames):
-        jitter[k] = memory * jitter[k - 1] + math.sqrt(1 - memory**2) * shocks[k]
-    return speed_mps * (1 + share * jitter)
+    return np.asarray(speed_mps * (1 + share * correlated(n_frames, tau_frames, rng)))
 
 
 def wavy_speed(

@@ -10,13 +10,13 @@ from pathlib import Path
 
 import cv2
 import numpy as np
-import scipy.signal
 
 from pipelines.geometry import Floats
 from pipelines.simulation import trajectories as way
 from pipelines.simulation.channels import rng_of
 from pipelines.simulation.families import FAMILIES, ground
 from pipelines.simulation.mission import PAPER_HEIGHT_M, nadir_mission
+from pipelines.simulation.noise import correlated
 from pipelines.simulation.surfaces import PAPER_METRES_PER_PX, Surface, surface_from_image
 from readers.streams import Recording
 from workbench.settings import SettingsError
@@ -95,14 +95,8 @@ CONDITIONS = (
 
 
 def fluctuation(n: int, sigma: float, rng: np.random.Generator, tau_frames: float = TAU_FRAMES) -> Floats:
-    """Gaussian noise [n] of standard deviation `sigma` whose correlation falls to 1/e in `tau_frames`: AR(1).
-
-    x_k = a x_{k-1} + sqrt(1 - a²) σ w_k with a = exp(-1/τ).
-    """
-    memory = math.exp(-1 / tau_frames)
-    shocks = rng.standard_normal(n) * math.sqrt(1 - memory**2)
-    shocks[:1] /= math.sqrt(1 - memory**2)
-    return np.asarray(sigma * scipy.signal.lfilter([1.0], [1.0, -memory], shocks))
+    """Tilt or height [n] of standard deviation `sigma`: `correlated` noise."""
+    return sigma * correlated(n, tau_frames, rng)
 
 
 # -------------------------------------------------------------------------------- missions
