@@ -13,12 +13,8 @@ import functools
 import hashlib
 import itertools
 import math
-import subprocess
-import sys
-import tempfile
 import time
-import warnings
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import TYPE_CHECKING, Any, Literal, Self
@@ -28,7 +24,6 @@ import numpy as np
 import pyarrow as pa
 import rerun as rr
 from numpy.typing import NDArray
-from rerun.chunk import RrdReader
 
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
@@ -55,6 +50,9 @@ from workbench.rrd_file import (
     texts,
 )
 from workbench.rrd_ranges import RangeDrawing
+from workbench.rrd_reading import chunks
+from workbench.rrd_reading import merge as merge
+from workbench.rrd_reading import recover as recover
 from workbench.schema import Archetype, Row, Schema, schema_of
 
 if TYPE_CHECKING:
@@ -423,8 +421,8 @@ def _number(value: str | float | int) -> str:
 # ----------------------------------------------------------------------------- reading
 
 
-def read_steps(path: Path | str, run: str, step_type: type[Step]) -> list[Step]:
-    """The Steps of a run, from a finished file or from what a killed process left.
+def read_steps(path: Path | str, run: str, step_type: type[Step], frames: range | None = None) -> list[Step]:
+    """The Steps of a run, or of some of its frames, from a finished file or from what a killed process left.
 
     Every number is exactly the one that was logged, surfaces within the step of float16. All steps stand in
     memory at once, about 25 kB each with nine surfaces: of a long run, take single fields with `read_fields`.
@@ -434,30 +432,40 @@ def read_steps(path: Path | str, run: str, step_type: type[Step]) -> list[Step]:
     """
     schema = schema_of(step_type)
     fields = [row.field for row in schema.rows]
-    return list(traces.rebuild(schema, read_fields(path, run, step_type, fields)))
+    return list(traces.rebuild(schema, read_fields(path, run, step_type, fields, frames)))
 
 
-def read_fields(path: Path | str, run: str, step_type: type[Step], fields: Iterable[str]) -> dict[str, Sequence[Any]]:
+def read_fields(
+    path: Path | str, run: str, step_type: type[Step], fields: Iterable[str], frames: range | None = None
+) -> dict[str, Sequence[Any]]:
     """Some fields of a run's steps: one value per frame, in the order of the frames.
 
+    Args:
+        path: the run's file.
+        run: name of the run.
+        step_type: class of its steps.
+        fields: names of fields.
+        frames: numbers of the frames, a range without steps; None for all.
+
     Raises:
-        RecordingError: the file cannot be read, or holds no such run.
+        RecordingError: the file cannot be read, or holds no such run or none of the frames.
     """
     schema = schema_of(step_type)
     wanted = list(fields)
     needed = schema.sharing({*wanted, "verdict", *(_SURFACE_NEEDS if "surface" in wanted else ())})
     components = sorted({row.component for row in needed if row.component} | {_FORMAT})
-    rows = _whole_rows(_chunks(Path(path), f"/runs/{run}/**", components=components), needed)
-    frames, t_ns, _ = next(iter(rows.values()))
-    if not len(frames):
-        raise RecordingError(path, f"holds no steps of a run named {run!r}", "name a run of this file")
+    rows = _whole_rows(chunks(Path(path), f"/runs/{run}/**", components=components), needed, frames)
+    numbers, t_ns, _ = next(iter(rows.values()))
+    if not len(numbers):
+        some = "" if frames is None else f" from frame {frames.start} to before {frames.stop}"
+        raise RecordingError(path, f"holds no steps of a run named {run!r}{some}", "name a run of this file")
     table: dict[str, Sequence[Any]] = {}
     for entity, group in schema.of(Archetype.SCALARS).items():
         if (entity, group[0].component) in rows:
             table |= _split(schema, group, rows[entity, group[0].component][2])
     for row in needed:
         if row.archetype is Archetype.TIMELINE:
-            table[row.field] = {"frame": frames, "sensor_time": t_ns}[row.entity].tolist()
+            table[row.field] = {"frame": numbers, "sensor_time": t_ns}[row.entity].tolist()
         elif row.archetype is Archetype.INTEGERS:
             table[row.field] = [int(value[0]) for value in rows[row.entity, row.component][2]]
         elif row.archetype is Archetype.SURFACES:
@@ -493,8 +501,10 @@ _SURFACE_NEEDS = ("fragment_px", "fragment_side_px")  # where each surface lies 
 _Rows = tuple[Ints, Ints, list[Any]]
 
 
-def _whole_rows(chunks: Iterable[Any], needed: Iterable[Row]) -> dict[tuple[str, str], _Rows]:
-    """Frames, sensor times and values of each component, in the order of the frames.
+def _whole_rows(
+    chunks: Iterable[Any], needed: Iterable[Row], wanted: range | None = None
+) -> dict[tuple[str, str], _Rows]:
+    """Frames, sensor times and values of each component, in the order of the frames; of the wanted frames only.
 
     Frames that lack a component are left out: they stood at the torn end of a file.
     """
@@ -510,8 +520,11 @@ def _whole_rows(chunks: Iterable[Any], needed: Iterable[Row]) -> dict[tuple[str,
         if entity not in entities:
             continue
         batch = chunk.to_record_batch()
+        if wanted is not None:
+            numbers = batch.column("frame").to_numpy()
+            batch = batch.filter(pa.array((numbers >= wanted.start) & (numbers < wanted.stop)))
         for component in batch.schema.names:
-            if (entity, component) in parts:
+            if batch.num_rows and (entity, component) in parts:
                 frames = batch.column("frame").to_numpy()
                 t_ns = batch.column("sensor_time").to_numpy().astype(np.int64)
                 parts[entity, component].append((frames, t_ns, _lists(batch.column(component))))
@@ -572,64 +585,7 @@ def _lists(column: pa.ListArray) -> list[Any]:
     return [flat[a:b] for a, b in itertools.pairwise(bounds)]
 
 
-def _chunks(
-    path: Path, content: str, *, is_static: bool | None = False, components: Sequence[str] | None = None
-) -> Iterator[Any]:
-    """The chunks of some entities, also of a file without a footer or with a torn end."""
-    if not path.is_file():
-        raise RecordingError(path, "there is no such file", "give the path of an .rrd file")
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore")
-        try:
-            yield from _stream(path).filter(content=content, is_static=is_static, components=components)
-        except RuntimeError:
-            with tempfile.TemporaryDirectory() as folder:
-                fixed = Path(folder) / "recovered.rrd"
-                recover(path, fixed)
-                yield from _stream(fixed).filter(content=content, is_static=is_static, components=components)
-
-
-def _stream(path: Path) -> Any:
-    reader = RrdReader(path)
-    try:
-        return reader.store().stream()
-    except RuntimeError:
-        return reader.stream()
-
-
 # ------------------------------------------------------------------------- whole files
-
-
-_CURE = "give a file that a replay wrote"
-
-
-def merge(paths: Sequence[Path | str], out: Path | str) -> None:
-    """Join files of one mission into one portable file.
-
-    Raises:
-        RecordingError: a file cannot be read.
-    """
-    _tool(Path(paths[0]), "merge", *map(str, paths), "-o", str(out))
-
-
-def recover(path: Path | str, out: Path | str) -> None:
-    """Copy what is whole of an unfinished or torn file and write a footer.
-
-    Raises:
-        RecordingError: nothing can be read.
-    """
-    _tool(Path(path), "filter", str(path), "-o", str(out), "--continue-on-error")
-    if not RrdReader(out).recordings():
-        raise RecordingError(path, "is not a Rerun recording, or nothing of it is whole", _CURE)
-
-
-def _tool(path: Path, *arguments: str) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "rerun", "rrd", *arguments], capture_output=True, text=True, check=False
-    )
-    if done.returncode:
-        reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
-        raise RecordingError(path, f"cannot be read as a Rerun recording ({reason})", _CURE)
 
 
 def digest(path: Path | str) -> str:
@@ -639,7 +595,7 @@ def digest(path: Path | str) -> str:
         RecordingError: the file cannot be read.
     """
     rows: dict[tuple[str, ...], list[bytes]] = {}
-    for chunk in _chunks(Path(path), "/**", is_static=None):
+    for chunk in chunks(Path(path), "/**", is_static=None):
         batch = chunk.to_record_batch()
         names = sorted(name for name in batch.schema.names if not name.startswith("rerun.controls."))
         for row in batch.select(names).to_pylist():

@@ -1,0 +1,7 @@
+"""Rules for runs of the path estimator."""
+
+from __future__ import annotations
+
+from workbench.diagnosis.finding import Rule
+
+RULES: tuple[Rule, ...] = ()

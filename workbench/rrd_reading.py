@@ -1,0 +1,243 @@
+"""Reading ``.rrd`` files quickly: whole columns of numbers, single frames, images; also of files with a torn end."""
+
+from __future__ import annotations
+
+import functools
+import math
+import subprocess
+import sys
+import tempfile
+import warnings
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+from rerun.chunk import RrdReader
+
+from readers.streams import RecordingError
+from workbench.schema import Archetype, Row, Schema
+
+Ints = NDArray[np.int64]
+Floats = NDArray[np.float64]
+
+
+class Series(NamedTuple):
+    """Rows of one component: frames [n] (-1 where the row belongs to none), sensor times [n] in ns, values."""
+
+    frame: Ints
+    t_ns: Ints
+    values: NDArray[Any]
+
+
+def chunks(
+    path: Path, content: str, *, is_static: bool | None = False, components: Sequence[str] | None = None
+) -> Iterator[Any]:
+    """The chunks of some entities, also of a file without a footer or with a torn end.
+
+    Raises:
+        RecordingError: there is no such file, or nothing of it can be read.
+    """
+    if not path.is_file():
+        raise RecordingError(path, "there is no such file", "give the path of an .rrd file")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            yield from _stream(path).filter(content=content, is_static=is_static, components=components)
+        except RuntimeError:
+            with tempfile.TemporaryDirectory() as folder:
+                fixed = Path(folder) / "recovered.rrd"
+                recover(path, fixed)
+                yield from _stream(fixed).filter(content=content, is_static=is_static, components=components)
+
+
+def _stream(path: Path) -> Any:
+    reader = RrdReader(path)
+    try:
+        return reader.store().stream()
+    except RuntimeError:
+        return reader.stream()
+
+
+def series(path: Path, entity: str, component: str) -> Series:
+    """All rows of one component of one entity, in the order of their frames, then times; n is 0 where there are none.
+
+    Values are [n, k] where all rows hold k numbers, else an array [n] of arrays.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    return _joined(chunks(path, entity, components=[component]), component)
+
+
+def _joined(parts: Iterable[Any], component: str) -> Series:
+    frames, times, values = [], [], []
+    for chunk in parts:
+        batch = chunk.to_record_batch()
+        if component not in batch.schema.names:
+            continue
+        times.append(batch.column("sensor_time").to_numpy().astype(np.int64))
+        named = "frame" in batch.schema.names
+        frames.append(batch.column("frame").to_numpy() if named else np.full(len(times[-1]), -1))
+        values.append(_rows(batch.column(component)))
+    if not times:
+        return Series(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 0)))
+    frame, t_ns = np.concatenate(frames), np.concatenate(times)
+    order = np.lexsort((t_ns, frame))
+    return Series(frame[order], t_ns[order], _stacked(values)[order])
+
+
+def _rows(column: pa.ListArray) -> NDArray[Any]:
+    """The rows of an Arrow column of lists: [n, k] of numbers where all are equally long, else [n] of arrays."""
+    lengths = column.value_lengths().to_numpy(zero_copy_only=False)
+    flat = column.flatten()
+    if not (pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)):
+        return _objects(column.to_pylist())
+    numbers = flat.to_numpy(zero_copy_only=False)
+    if len(lengths) and (lengths == lengths[0]).all():
+        table: NDArray[Any] = numbers.reshape(len(lengths), int(lengths[0]))
+        return table
+    return _objects(np.split(numbers, np.cumsum(lengths)[:-1]))
+
+
+def _objects(items: Sequence[Any]) -> NDArray[Any]:
+    array = np.empty(len(items), object)
+    array[:] = items
+    return array
+
+
+def _stacked(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
+    """Rows one after another; [n] of arrays where their lengths differ."""
+    if all(part.ndim == 2 and part.shape[1] == parts[0].shape[1] for part in parts):
+        return np.concatenate(parts)
+    ragged: NDArray[Any] = np.concatenate([_objects(list(part)) for part in parts])
+    return ragged
+
+
+def columns(path: Path, root: str, schema: Schema, fields: Iterable[str]) -> dict[str, NDArray[Any]]:
+    """Fields of all steps of a run as arrays [n, *shape], with ``frame`` and ``t_ns`` [n]; surfaces are not for it.
+
+    Frames that lack one of the fields' entities are left out: they stood at the torn end of a file. Where the shape
+    changes within a run, the fields of the steps with fewer numbers are filled up with NaN at the end.
+
+    Args:
+        path: the run's file.
+        root: entity path of the run, ``/runs/RUN/ESTIMATOR``.
+        schema: the rows of its steps.
+        fields: names of fields.
+
+    Raises:
+        RecordingError: the file cannot be read, or holds no such run.
+    """
+    wanted = list(dict.fromkeys(fields))
+    needed = schema.sharing({*wanted, "verdict"})
+    components = sorted({row.component for row in needed if row.component})
+    groups: dict[tuple[str, str], list[Any]] = {(row.entity, row.component): [] for row in needed if row.component}
+    for chunk in chunks(path, f"{root}/**", components=components):
+        for name in components:
+            key = (chunk.entity_path.removeprefix(f"{root}/"), name)
+            if key in groups:
+                groups[key].append(chunk)
+    rows = {key: _joined(parts, key[1]) for key, parts in groups.items()}
+    whole = functools.reduce(np.intersect1d, (part.frame for part in rows.values()))
+    if not len(whole):
+        raise RecordingError(path, f"holds no steps of a run at {root}", "name a run of this file")
+    rows = {key: _only(part, whole) for key, part in rows.items()}
+    first = next(iter(rows.values()))
+    found: dict[str, NDArray[Any]] = {"frame": first.frame, "t_ns": first.t_ns}
+    for entity, group in schema.of(Archetype.SCALARS).items():
+        if (entity, group[0].component) in rows:
+            found |= _split(schema, group, rows[entity, group[0].component].values)
+    for row in needed:
+        if row.archetype is Archetype.INTEGERS:
+            found[row.field] = rows[row.entity, row.component].values[:, 0]
+    return {name: found[name] for name in ("frame", "t_ns", *wanted) if name in found}
+
+
+def _only(part: Series, whole: Ints) -> Series:
+    kept = np.isin(part.frame, whole)
+    return part if kept.all() else Series(part.frame[kept], part.t_ns[kept], part.values[kept])
+
+
+def _split(schema: Schema, rows: Sequence[Row], values: NDArray[Any]) -> dict[str, NDArray[Any]]:
+    """The columns of a group of scalars [n, k] as those of its fields."""
+    if values.dtype == object:
+        values = _filled(values)
+    found: dict[str, NDArray[Any]] = {}
+    start = 0
+    for row in rows:
+        shape = schema.shape(row.field)
+        fixed = [n for n in shape if isinstance(n, int)]
+        width = math.prod(fixed)
+        if len(fixed) < len(shape):  # it has the entity to itself
+            found[row.field] = values.reshape(len(values), -1, *fixed)
+        else:
+            part = values[:, start : start + width]
+            found[row.field] = part.reshape(len(values), *fixed) if shape else part[:, 0]
+        start += width
+    kinds = schema.kinds
+    return {name: array.astype(np.int64) if kinds[name] in (int, bool) else array for name, array in found.items()}
+
+
+def _filled(values: NDArray[Any]) -> Floats:
+    """Rows of different lengths as one array, NaN behind the shorter ones."""
+    filled = np.full((len(values), max(map(len, values))), np.nan)
+    for row, numbers in zip(filled, values, strict=True):
+        row[: len(numbers)] = numbers
+    return filled
+
+
+def stored_image(path: Path, entity: str, frame: int) -> Mapping[str, Any] | None:
+    """One frame's image as it was logged: the components of its row by name; None where the frame has none.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    for chunk in chunks(path, entity):
+        batch = chunk.to_record_batch()
+        if "frame" not in batch.schema.names:
+            continue
+        at = np.flatnonzero(batch.column("frame").to_numpy() == frame)
+        if len(at):
+            row = batch.slice(int(at[0]), 1)
+            found = {name: row.column(name)[0].as_py() for name in row.schema.names if ":" in name}
+            if any(found.values()):
+                return found
+    return None
+
+
+# ------------------------------------------------------------------------- whole files
+
+
+_CURE = "give a file that a replay wrote"
+
+
+def merge(paths: Sequence[Path | str], out: Path | str) -> None:
+    """Join files of one mission into one portable file.
+
+    Raises:
+        RecordingError: a file cannot be read.
+    """
+    _tool(Path(paths[0]), "merge", *map(str, paths), "-o", str(out))
+
+
+def recover(path: Path | str, out: Path | str) -> None:
+    """Copy what is whole of an unfinished or torn file and write a footer.
+
+    Raises:
+        RecordingError: nothing can be read.
+    """
+    _tool(Path(path), "filter", str(path), "-o", str(out), "--continue-on-error")
+    if not RrdReader(out).recordings():
+        raise RecordingError(path, "is not a Rerun recording, or nothing of it is whole", _CURE)
+
+
+def _tool(path: Path, *arguments: str) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "rerun", "rrd", *arguments], capture_output=True, text=True, check=False
+    )
+    if done.returncode:
+        reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
+        raise RecordingError(path, f"cannot be read as a Rerun recording ({reason})", _CURE)
