@@ -119,12 +119,12 @@ SLOWED = textwrap.dedent(
     import sys, time
     from workbench import cli
 
-    class Slow(cli._Bar):
+    class Slow(cli.Bar):
         def __call__(self, progress):
             print(progress.done, time.monotonic(), flush=True)
             time.sleep(0.012)
 
-    cli._Bar = Slow
+    cli.Bar = Slow
     sys.exit(cli.main())
     """
 )

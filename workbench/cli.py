@@ -1,4 +1,6 @@
-"""The commands: inspect, replay, simulate, view, demo, reproduce, settings. The only module that prints.
+"""The commands about recordings: inspect, replay, simulate, view, demo, reproduce, settings.
+
+Those about finished runs are in `cli_runs.py`. Only these modules and `terminal.py` print.
 
 What a command concludes goes to stdout, progress and errors to stderr. Exit status: 0 done; 2 a request that
 cannot be met (one line says why); 3 the recording could be read only in part; 130 interrupted; 1 a fault of the
@@ -7,19 +9,31 @@ workbench itself. Everything heavy is imported inside the commands, so that help
 
 from __future__ import annotations
 
-import json
 import os
 import subprocess
 import sys
-import threading
-import time
 import traceback
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from pathlib import Path
-from types import TracebackType
-from typing import TYPE_CHECKING, Annotated, Any, NoReturn, Self
+from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
+
+from workbench.terminal import (
+    FAULT,
+    IN_PART,
+    INTERRUPTED,
+    REFUSED,
+    Bar,
+    Bars,
+    examples,
+    moment,
+    print_error,
+    print_json,
+    print_list,
+    shown,
+    table,
+)
 
 if TYPE_CHECKING:
     from pipelines.simulation.mission import SimulatedMission
@@ -27,16 +41,8 @@ if TYPE_CHECKING:
     from workbench.reproduce import paper_b
     from workbench.reproduce.judged import Statement
     from workbench.reproduce.paper_a import Reproduced
-    from workbench.session import Outcome, Progress, Request
+    from workbench.session import Outcome, Request
 
-REFUSED, IN_PART, INTERRUPTED, FAULT = 2, 3, 130, 1
-EPOCH_NS = 100_000_000_000_000_000
-WIDEST = 60
-BAR_SECONDS = 0.1
-LINE_SECONDS = 5.0
-PATIENCE_SECONDS = 2.0
-
-FIRST_START = "the first start compiles what it needs, which takes up to a minute; later ones do not"
 
 app = typer.Typer(
     name="workbench",
@@ -54,11 +60,6 @@ app = typer.Typer(
     pretty_exceptions_enable=False,
     context_settings={"max_content_width": 100},
 )
-
-
-def _examples(*lines: str) -> str:
-    """Examples below a command's help, line by line as they stand."""
-    return "\n  ".join(("\b\nExamples:", *lines))
 
 
 RecordingPath = Annotated[
@@ -93,7 +94,7 @@ def _common(
 
 @app.command(
     short_help="What is in a recording, and what is odd about it.",
-    epilog=_examples(
+    epilog=examples(
         "workbench inspect mission.bag",
         "workbench inspect frames/ --rate 30",
         "workbench inspect mission.mcap --json | jq '.streams[].name'",
@@ -115,7 +116,7 @@ def inspect(
         facts = [] if quick else _survey(recording)
         values = _recording_values(recording, facts)
         if as_json:
-            _print_json(values)
+            print_json(values)
         else:
             _print_recording(recording, values)
         if values["damage"]:
@@ -187,10 +188,10 @@ def _print_recording(recording: Recording, values: Mapping[str, Any]) -> None:
     print("\n".join(table(heads, rows, right=(2, 3, 4, 5))) if rows else "no streams")
     for name, camera in recording.cameras.items():
         print(f"\ncamera of {shown(name)}: {_camera_text(camera)}")
-    _print_list("notes", values["notes"])
-    _print_list("not readable", [_unreadable(info) for info in recording.streams if not info.readable])
-    _print_list("damage", values["damage"])
-    _print_list("oddities", [f"{fact['stream']}: {fact['sentence']}" for fact in values["facts"]])
+    print_list("notes", values["notes"])
+    print_list("not readable", [_unreadable(info) for info in recording.streams if not info.readable])
+    print_list("damage", values["damage"])
+    print_list("oddities", [f"{fact['stream']}: {fact['sentence']}" for fact in values["facts"]])
 
 
 def _unreadable(info: StreamInfo) -> str:
@@ -227,7 +228,7 @@ def _camera_text(camera: Camera) -> str:
 
 @app.command(
     short_help="Replay a recording; write all that was computed.",
-    epilog=_examples(
+    epilog=examples(
         "workbench replay mission.bag",
         "workbench replay mission.bag --preset paper-a --from 10 --to 20",
         "workbench replay mission.bag --set search_radius_px=16 --name wide",
@@ -328,7 +329,7 @@ def replay(
 def _conclude(outcome: Outcome, as_json: bool) -> NoReturn:
     """Print what became of a replay and leave with its exit status."""
     if as_json:
-        _print_json(outcome.summary | {"folder": str(outcome.folder), "files": _files(outcome)})
+        print_json(outcome.summary | {"folder": str(outcome.folder), "files": _files(outcome)})
     else:
         _print_summary(outcome)
     raise typer.Exit(_status(outcome))
@@ -337,7 +338,7 @@ def _conclude(outcome: Outcome, as_json: bool) -> NoReturn:
 def _replay(request: Request, recording: Recording | None = None) -> Outcome:
     from workbench.session import run
 
-    with _Bar(request.name or request.preset or request.estimator) as bar:
+    with Bar(request.name or request.preset or request.estimator) as bar:
         return run(request, recording=recording, on_progress=bar)
 
 
@@ -347,11 +348,11 @@ def _status(outcome: Outcome) -> int:
     if summary["interrupted"]:
         return INTERRUPTED
     if summary["stopped_early"]:
-        _error(summary["stopped_early"])
+        print_error(summary["stopped_early"])
         return IN_PART
     calibration = summary["calibration"]
     if calibration is not None and not calibration["key"]:
-        _error(f"--calibrate: {calibration['sentence']}")
+        print_error(f"--calibrate: {calibration['sentence']}")
         return REFUSED
     return IN_PART if summary["damage"] else 0
 
@@ -381,7 +382,7 @@ def _print_summary(outcome: Outcome) -> None:
 
 @app.command(
     short_help="Make a mission with exact truth and known faults, by scenario.",
-    epilog=_examples(
+    epilog=examples(
         "workbench simulate --list",
         "workbench simulate fault-motion-blur -o blur.mcap",
         "workbench simulate fault-motion-blur --set faults.0.exposure=0.5 --replay",
@@ -476,7 +477,7 @@ def _write_mission(
     from workbench.writers import write
 
     form: Any = None if images is None else _one_of(images, ("jpeg", "png", "stored"), "--images")
-    with _Bar(out.name, "message") as bar:
+    with Bar(out.name, "message") as bar:
         try:
             written = write(
                 mission,
@@ -493,12 +494,12 @@ def _write_mission(
     if as_json:
         faults = [{"name": f.name, "start_s": f.start_s, "stop_s": f.stop_s} for f in mission.faults]
         left_out = dict(written.left_out)
-        _print_json({"path": str(out), "messages": written.messages, "left_out": left_out, "faults": faults})
+        print_json({"path": str(out), "messages": written.messages, "left_out": left_out, "faults": faults})
         return
     rows = [(topic, str(count)) for topic, count in written.messages.items()]
     print("\n".join([f"{out}: {mission.path.name}", "", *table(("stream", "messages"), rows, right=(1,))]))
-    _print_list("left out", [f"{stream}: {why}" for stream, why in written.left_out.items()])
-    _print_list("faults", [f"{f.name} from {f.start_s:.3f} to {f.stop_s:.3f} s" for f in mission.faults])
+    print_list("left out", [f"{stream}: {why}" for stream, why in written.left_out.items()])
+    print_list("faults", [f"{f.name} from {f.start_s:.3f} to {f.stop_s:.3f} s" for f in mission.faults])
     print(f"\nreplay it with: workbench replay {out}")
 
 
@@ -507,7 +508,7 @@ def _write_mission(
 
 @app.command(
     short_help="Look at one or several runs in the Rerun viewer.",
-    epilog=_examples(
+    epilog=examples(
         "workbench view results/mission",
         "workbench view results/mission/best.rrd results/mission/paper-a.rrd",
         "workbench view results/mission --web",
@@ -573,7 +574,7 @@ def _has_display() -> bool:
 
 @app.command(
     short_help="Replay the built-in recording.",
-    epilog=_examples(
+    epilog=examples(
         "workbench demo && workbench view results/demo",
     ),
 )
@@ -597,7 +598,7 @@ def demo(
         if status := _status(outcome):
             raise typer.Exit(status)
     if as_json:
-        _print_json({"folder": str(out), "runs": {o.summary["run"]: o.summary for o in outcomes}})
+        print_json({"folder": str(out), "runs": {o.summary["run"]: o.summary for o in outcomes}})
         return
     print(f"Both runs lie in {out}. Look at them, one over the other, with:\n  workbench view {out}")
 
@@ -627,7 +628,7 @@ app.add_typer(reproduce, name="reproduce", short_help="Repeat a paper's experime
 @reproduce.command(
     "paper-a",
     short_help="Ground-surface odometry (paper A, experiment 3.2).",
-    epilog=_examples(
+    epilog=examples(
         "workbench reproduce paper-a",
         "workbench reproduce paper-a --seeds 5",
         "workbench reproduce paper-a --matrix --limits",
@@ -670,10 +671,10 @@ def reproduce_paper_a(
         overrides=tuple(overrides or ()),
         command=_as_typed(out, surface, frames, seeds, matrix, limits, overrides),
     )
-    with _Bars() as bars:
+    with Bars() as bars:
         done = paper_a.reproduce(plan, bars)
     if as_json:
-        _print_json(report.values(done.results) | {"folder": str(done.folder), "interrupted": done.interrupted})
+        print_json(report.values(done.results) | {"folder": str(done.folder), "interrupted": done.interrupted})
     else:
         _print_reproduced(done)
     raise typer.Exit(INTERRUPTED if done.interrupted else 0)
@@ -731,7 +732,7 @@ def _print_statements(statements: Iterable[Statement], unfinished: Iterable[str]
 @reproduce.command(
     "paper-b",
     short_help="Range to landmarks from ego-motion (paper B, section 4).",
-    epilog=_examples(
+    epilog=examples(
         "workbench reproduce paper-b",
         "workbench reproduce paper-b --runs 1000 --seeds 100",
         "workbench simulate paper-b -o paper-b.mcap",
@@ -757,10 +758,10 @@ def reproduce_paper_b(
 
     words = ["workbench", "reproduce", "paper-b", "-o", str(out), "--runs", str(runs), "--seeds", str(seeds)]
     plan = paper_b.Plan(out=out, runs=runs, seeds=seeds, command=shlex.join(words))
-    with _Bars() as bars:
+    with Bars() as bars:
         done = paper_b.reproduce(plan, bars)
     if as_json:
-        _print_json(report.values(done.results) | {"folder": str(done.folder), "interrupted": done.interrupted})
+        print_json(report.values(done.results) | {"folder": str(done.folder), "interrupted": done.interrupted})
     else:
         _print_ranges(done)
     raise typer.Exit(INTERRUPTED if done.interrupted else 0)
@@ -781,7 +782,7 @@ def _print_ranges(done: paper_b.Reproduced) -> None:
 
 @app.command(
     short_help="Print the settings of a preset as a settings file.",
-    epilog=_examples(
+    epilog=examples(
         "workbench settings --preset paper-a > mine.toml",
         "workbench replay mission.bag --settings mine.toml",
     ),
@@ -833,129 +834,6 @@ def _one_of(text: str, known: Sequence[str], option: str) -> str:
     return text
 
 
-def shown(text: str, widest: int | None = 400) -> str:
-    """A text from a file, safe for a terminal: control characters escaped, at most `widest` characters."""
-    safe = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
-    return safe if widest is None or len(safe) <= widest else f"{safe[: widest - 1]}…"
-
-
-def moment(t_ns: int) -> str:
-    """A time as a date (UTC) where it can be one, else in seconds."""
-    if t_ns < EPOCH_NS:
-        return f"{t_ns / 1e9:.3f} s"
-    seconds, rest = divmod(t_ns, 1_000_000_000)
-    return time.strftime("%Y-%m-%d %H:%M:%S", time.gmtime(seconds)) + f".{rest // 1_000_000:03d} UTC"
-
-
-def table(heads: Sequence[str], rows: Iterable[Sequence[str]], right: Sequence[int] = ()) -> list[str]:
-    """Lines of a table with columns as wide as their longest entry; the last one is not padded."""
-    cells = [tuple(heads), *(tuple(shown(cell, WIDEST) for cell in row) for row in rows)]
-    widths = [max(len(row[k]) for row in cells) for k in range(len(heads))]
-    return [
-        "  ".join(
-            c.rjust(w) if k in right else c.ljust(w) for k, (c, w) in enumerate(zip(row, widths, strict=True))
-        ).rstrip()
-        for row in cells
-    ]
-
-
-def _print_list(title: str, texts: Sequence[str]) -> None:
-    if texts:
-        print(f"\n{title}:")
-        for text in texts:
-            print(f"  {shown(text)}")
-
-
-def _print_json(values: Mapping[str, Any]) -> None:
-    from workbench.summary import without_nan
-
-    print(json.dumps(without_nan(values), indent=2, ensure_ascii=True, allow_nan=False))
-
-
-class _Bar:
-    """Progress on stderr: a bar with the time left on a terminal, else a line every few seconds."""
-
-    def __init__(self, title: str, unit: str = "frame") -> None:
-        self._title, self._unit = title, unit
-        self._live: Any = None
-        self._task: Any = None
-        self._told = time.monotonic()
-        self._began = self._told
-        self._patience = threading.Timer(PATIENCE_SECONDS, self._console, [f"no {unit} yet: " + FIRST_START])
-        self._patience.daemon = True
-
-    def __enter__(self) -> Self:
-        self._patience.start()
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        self._patience.cancel()
-        if self._live is not None:
-            self._live.stop()
-
-    def __call__(self, progress: Progress) -> None:
-        """Take note of a frame; show it if the last time is long enough ago."""
-        self._patience.cancel()
-        now = time.monotonic()
-        terminal = sys.stderr.isatty()
-        if now - self._told < (BAR_SECONDS if terminal else LINE_SECONDS) and progress.done != progress.total:
-            return
-        self._told = now
-        if terminal:
-            self._draw(progress)
-        else:
-            of = "" if progress.total is None else f" of {progress.total}"
-            speed = progress.done / max(now - self._began, 1e-9)
-            self._console(f"{self._unit} {progress.done}{of}, {speed:.0f} {self._unit}s/s")
-
-    def _console(self, text: str) -> None:
-        print(f"{self._title}: {text}", file=sys.stderr, flush=True)
-
-    def _draw(self, progress: Progress) -> None:
-        if self._live is None:
-            from rich.console import Console
-            from rich.progress import BarColumn, MofNCompleteColumn, TextColumn, TimeRemainingColumn
-            from rich.progress import Progress as Live
-
-            columns = (TextColumn("{task.description}"), BarColumn(), MofNCompleteColumn(), TimeRemainingColumn())
-            self._live = Live(*columns, console=Console(stderr=True))
-            self._live.start()
-            self._task = self._live.add_task(self._title, total=progress.total)
-        self._live.update(self._task, completed=progress.done)
-
-
-class _Bars:
-    """Progress of several things, one bar after the other."""
-
-    def __init__(self) -> None:
-        self._title = ""
-        self._bar: _Bar | None = None
-
-    def __enter__(self) -> Self:
-        return self
-
-    def __exit__(
-        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
-    ) -> None:
-        if self._bar is not None:
-            self._bar.__exit__(kind, error, trace)
-
-    def __call__(self, title: str, done: int, total: int) -> None:
-        """Show how far the thing of that title is."""
-        from workbench.session import Progress
-
-        if self._bar is None or title != self._title:
-            self.__exit__(None, None, None)
-            self._title, self._bar = title, _Bar(title)
-        self._bar(Progress(done, total, 0))
-
-
-def _error(text: str) -> None:
-    print(f"error: {shown(text, None)}", file=sys.stderr, flush=True)
-
-
 # ----------------------------------------------------------------------------------- main
 
 
@@ -986,14 +864,14 @@ def _explain(error: Exception, debug: bool) -> int:
     where = "".join(f" ({note})" for note in getattr(error, "__notes__", ()))
     usage = getattr(error, "format_message", None)  # of the command line's own errors
     if usage is not None:
-        _error(usage() or "a command is missing; see workbench --help")
+        print_error(usage() or "a command is missing; see workbench --help")
         return REFUSED
     if isinstance(error, WorkbenchError):
-        _error(f"{error}{where}")
+        print_error(f"{error}{where}")
         return REFUSED
     if isinstance(error, OSError):
-        _error(f"{error.filename or 'the system'}: {error.strerror or error}{where}")
+        print_error(f"{error.filename or 'the system'}: {error.strerror or error}{where}")
         return REFUSED
     first_line = (str(error).splitlines() or [""])[0]
-    _error(f"unexpected {type(error).__name__}: {first_line}{where}; --debug shows where")
+    print_error(f"unexpected {type(error).__name__}: {first_line}{where}; --debug shows where")
     return FAULT

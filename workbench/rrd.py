@@ -50,7 +50,7 @@ from workbench.rrd_file import (
     texts,
 )
 from workbench.rrd_ranges import RangeDrawing
-from workbench.rrd_reading import chunks
+from workbench.rrd_reading import around, chunks
 from workbench.rrd_reading import merge as merge
 from workbench.rrd_reading import recover as recover
 from workbench.schema import Archetype, Row, Schema, schema_of
@@ -454,7 +454,8 @@ def read_fields(
     wanted = list(fields)
     needed = schema.sharing({*wanted, "verdict", *(_SURFACE_NEEDS if "surface" in wanted else ())})
     components = sorted({row.component for row in needed if row.component} | {_FORMAT})
-    rows = _whole_rows(chunks(Path(path), f"/runs/{run}/**", components=components), needed, frames)
+    parts = chunks(Path(path), f"/runs/{run}/**", components=components)
+    rows = _whole_rows(parts if frames is None else around(parts, frames), needed, frames)
     numbers, t_ns, _ = next(iter(rows.values()))
     if not len(numbers):
         some = "" if frames is None else f" from frame {frames.start} to before {frames.stop}"

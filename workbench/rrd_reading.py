@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import bisect
 import functools
+import itertools
 import math
 import subprocess
 import sys
@@ -61,6 +63,24 @@ def _stream(path: Path) -> Any:
         return reader.stream()
 
 
+def around(parts: Iterable[Any], frames: range) -> Iterator[Any]:
+    """Those of some chunks, each entity's ascending by frame as a run writes them, that reach into some frames.
+
+    Only a few are unpacked to find them.
+    """
+    by_entity: dict[str, list[Any]] = {}
+    for chunk in parts:
+        if "frame" in chunk.timeline_names:
+            by_entity.setdefault(chunk.entity_path, []).append(chunk)
+    for ordered in by_entity.values():
+        first = max(bisect.bisect_right(ordered, frames.start, key=_first_frame) - 1, 0)
+        yield from itertools.takewhile(lambda chunk: _first_frame(chunk) < frames.stop, ordered[first:])
+
+
+def _first_frame(chunk: Any) -> int:
+    return int(chunk.to_record_batch().column("frame")[0].as_py())
+
+
 def series(path: Path, entity: str, component: str) -> Series:
     """All rows of one component of one entity, in the order of their frames, then times; n is 0 where there are none.
 
@@ -84,9 +104,11 @@ def _joined(parts: Iterable[Any], component: str) -> Series:
         values.append(_rows(batch.column(component)))
     if not times:
         return Series(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 0)))
-    frame, t_ns = np.concatenate(frames), np.concatenate(times)
-    order = np.lexsort((t_ns, frame))
-    return Series(frame[order], t_ns[order], _stacked(values)[order])
+    found = Series(np.concatenate(frames), np.concatenate(times), _stacked(values))
+    if (np.diff(found.frame) > 0).all():
+        return found
+    order = np.lexsort((found.t_ns, found.frame))
+    return Series(found.frame[order], found.t_ns[order], found.values[order])
 
 
 def _rows(column: pa.ListArray) -> NDArray[Any]:
@@ -141,7 +163,7 @@ def columns(path: Path, root: str, schema: Schema, fields: Iterable[str]) -> dic
             if key in groups:
                 groups[key].append(chunk)
     rows = {key: _joined(parts, key[1]) for key, parts in groups.items()}
-    whole = functools.reduce(np.intersect1d, (part.frame for part in rows.values()))
+    whole = functools.reduce(_common, (part.frame for part in rows.values()))
     if not len(whole):
         raise RecordingError(path, f"holds no steps of a run at {root}", "name a run of this file")
     rows = {key: _only(part, whole) for key, part in rows.items()}
@@ -156,9 +178,15 @@ def columns(path: Path, root: str, schema: Schema, fields: Iterable[str]) -> dic
     return {name: found[name] for name in ("frame", "t_ns", *wanted) if name in found}
 
 
+def _common(one: Ints, other: Ints) -> Ints:
+    return one if np.array_equal(one, other) else np.intersect1d(one, other)
+
+
 def _only(part: Series, whole: Ints) -> Series:
+    if np.array_equal(part.frame, whole):
+        return part
     kept = np.isin(part.frame, whole)
-    return part if kept.all() else Series(part.frame[kept], part.t_ns[kept], part.values[kept])
+    return Series(part.frame[kept], part.t_ns[kept], part.values[kept])
 
 
 def _split(schema: Schema, rows: Sequence[Row], values: NDArray[Any]) -> dict[str, NDArray[Any]]:
@@ -195,10 +223,8 @@ def stored_image(path: Path, entity: str, frame: int) -> Mapping[str, Any] | Non
     Raises:
         RecordingError: the file cannot be read.
     """
-    for chunk in chunks(path, entity):
+    for chunk in around(chunks(path, entity), range(frame, frame + 1)):
         batch = chunk.to_record_batch()
-        if "frame" not in batch.schema.names:
-            continue
         at = np.flatnonzero(batch.column("frame").to_numpy() == frame)
         if len(at):
             row = batch.slice(int(at[0]), 1)

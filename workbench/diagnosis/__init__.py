@@ -14,11 +14,16 @@ import numpy as np
 from workbench.diagnosis.finding import Case, Finding, Rule
 
 
-def rules_of(estimator: str) -> tuple[Rule, ...]:
-    """The rules for runs of one estimator."""
+def all_rules() -> tuple[Rule, ...]:
+    """Every rule that there is."""
     from workbench.diagnosis import path_rules, range_rules
 
-    return tuple(rule for rule in (*path_rules.RULES, *range_rules.RULES) if rule.estimator == estimator)
+    return (*path_rules.RULES, *range_rules.RULES)
+
+
+def rules_of(estimator: str) -> tuple[Rule, ...]:
+    """The rules for runs of one estimator."""
+    return tuple(rule for rule in all_rules() if rule.estimator == estimator)
 
 
 def diagnose(case: Case, rules: Iterable[Rule] | None = None) -> list[Finding]:
