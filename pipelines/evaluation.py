@@ -191,10 +191,8 @@ def evaluate(
     Raises:
         EvaluationError: fewer than 2 poses, or fewer than half of them, have a reference.
     """
-    at = associate(estimate.t_ns, reference, offset_ns=offset_ns, method=method, max_gap_ns=max_gap_ns)
-    index = np.flatnonzero(np.isfinite(at[:, 0]))
-    _demand_enough(len(index), estimate, reference, offset_ns)
-    truth, raw = at[index], estimate.pose[index]
+    index, truth = associated(estimate, reference, offset_ns=offset_ns, method=method, max_gap_ns=max_gap_ns)
+    raw = estimate.pose[index]
     fitted = align(raw, truth, with_scale=True)
     alignment = fitted if with_scale else align(raw, truth)
     aligned = alignment(raw)
@@ -271,6 +269,25 @@ def associate(
     return poses
 
 
+def associated(
+    estimate: Trajectory,
+    reference: Trajectory,
+    *,
+    offset_ns: int = 0,
+    method: Method = "interpolate",
+    max_gap_ns: int | None = None,
+) -> tuple[NDArray[np.int64], Floats]:
+    """Which poses [m] of the estimate have a reference at their time, and that reference [m, 3]; see `associate`.
+
+    Raises:
+        EvaluationError: fewer than 2 poses, or fewer than half of them, have one.
+    """
+    at = associate(estimate.t_ns, reference, offset_ns=offset_ns, method=method, max_gap_ns=max_gap_ns)
+    index = np.flatnonzero(np.isfinite(at[:, 0]))
+    _demand_enough(len(index), estimate, reference, offset_ns)
+    return index, at[index]
+
+
 def align(estimate: Floats, reference: Floats, *, with_scale: bool = False) -> Alignment:
     """The rotation, translation and (if asked) scale that bring the estimate's positions over the reference's.
 
@@ -323,7 +340,7 @@ def relative_error(estimate: Floats, reference: Floats, along: Floats, delta: fl
     i, j = start[pairs], stop[pairs]
     headings = bool(np.isfinite(reference[:, 2]).all() and np.isfinite(estimate[:, 2]).all())
     if headings:
-        q, p = _motion(reference, i, j), _motion(estimate, i, j)
+        q, p = motions(reference, i, j), motions(estimate, i, j)
         translation = np.hypot(p[:, 0] - q[:, 0], p[:, 1] - q[:, 1])
         turn = wrap_angles(p[:, 2] - q[:, 2])
     else:
@@ -336,6 +353,13 @@ def relative_error(estimate: Floats, reference: Floats, along: Floats, delta: fl
         translation_m=Statistics.of(translation),
         heading_rad=Statistics.of(turn),
     )
+
+
+def motions(pose: Floats, i: NDArray[np.intp], j: NDArray[np.intp]) -> Floats:
+    """Motions pose_i⁻¹ pose_j [m, 3] in the frame of pose i."""
+    dx, dy = (pose[j, :2] - pose[i, :2]).T
+    c, s = np.cos(pose[i, 2]), np.sin(pose[i, 2])
+    return np.column_stack([c * dx + s * dy, c * dy - s * dx, pose[j, 2] - pose[i, 2]])
 
 
 def path_lengths(positions: Floats) -> Floats:
@@ -382,13 +406,6 @@ def _growth(angles_rad: Floats) -> float:
     """How far an angle has turned from the first known value to the last one, whole turns included."""
     known = np.unwrap(angles_rad[np.isfinite(angles_rad)])
     return float(known[-1] - known[0]) if len(known) else math.nan
-
-
-def _motion(pose: Floats, i: NDArray[np.intp], j: NDArray[np.intp]) -> Floats:
-    """Motions pose_i⁻¹ pose_j [m, 3] in the frame of pose i."""
-    dx, dy = (pose[j, :2] - pose[i, :2]).T
-    c, s = np.cos(pose[i, 2]), np.sin(pose[i, 2])
-    return np.column_stack([c * dx + s * dy, c * dy - s * dx, pose[j, 2] - pose[i, 2]])
 
 
 def _distance(pose: Floats, i: NDArray[np.intp], j: NDArray[np.intp]) -> Floats:
