@@ -22,6 +22,8 @@ FIELD_OF_VIEW = math.radians(55)
 ASPECT = 1.35
 """Width over height of the map, at least."""
 MARGIN = 1.3
+MOST_LANES = 3
+"""Lanes of verdicts that stand side by side."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -109,6 +111,51 @@ def blueprint_of(step_type: type[Step], run: str, estimator: str, bounds: Bounds
     if issubclass(step_type, RangeStep):
         return range_blueprint(run, estimator, bounds)
     return rrb.Blueprint(*_panels(), auto_views=True, auto_layout=True)
+
+
+def compare_blueprint(
+    runs: Sequence[str], estimator: str, extent: Extent | None, frames: tuple[int, int], *, path_runs: bool
+) -> rrb.Blueprint:
+    """Several runs of one mission: image and map above; differences, errors and verdicts of all below."""
+    titles = (
+        {"distance": "Distance from the first run, m", "heading": "Heading from the first run, rad"}
+        if path_runs
+        else {"largest": "Largest relative difference of a range", "median": "Median relative difference"}
+    )
+    plots = [
+        rrb.TimeSeriesView(origin=f"/compare/{name}", name=title, axis_x=_axis(frames))
+        for name, title in titles.items()
+    ]
+    errors = [
+        rrb.TimeSeriesView(
+            origin=f"/runs/{run}/{estimator}/error", contents="$origin", name=f"Errors of {run}", axis_x=_axis(frames)
+        )
+        for run in (runs if path_runs else ())
+    ]
+    lanes = [
+        rrb.StateTimelineView(
+            origin=f"/runs/{run}/{estimator}",
+            contents=[f"/runs/{run}/{estimator}/verdict"],
+            name=f"Verdicts of {run}",
+            time_view=_axis(frames),
+        )
+        for run in runs
+    ]
+    contents = ["/world/compare/**", "/world/reference/**", "/world/scale"] if path_runs else ["/world/**"]
+    name = "Map: reference green, each run in its colour" if path_runs else "Map"
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(
+                _image("/camera/image", None, "Image with the marks of all runs"),
+                _map("", extent, name, contents=contents),
+            ),
+            rrb.Horizontal(*plots, *([rrb.Tabs(*errors)] if errors else [])),
+            rrb.Horizontal(*lanes) if len(lanes) <= MOST_LANES else rrb.Tabs(*lanes),
+            row_shares=[10, 8, 4],
+        ),
+        *_panels(),
+        auto_views=False,
+    )
 
 
 def correlation_blueprint(run: str, estimator: str = "correlation", bounds: Bounds | None = None) -> rrb.Blueprint:
@@ -279,6 +326,7 @@ def _map(
     extent: Extent | None,
     name: str = "Map: reference green, raw grey, corrected blue, aligned violet",
     trails: Sequence[str] = ("raw", "corrected"),
+    contents: str | Sequence[str] = "/world/**",
 ) -> rrb.Spatial3DView:
     """The ground from above, x to the right, y up; the trails of a run up to the cursor, where one is named."""
     eye = None
@@ -297,7 +345,7 @@ def _map(
     overrides: dict[Any, Any] = {f"/world/runs/{run}/{trailed}": trail for trailed in trails if run}
     return rrb.Spatial3DView(
         origin="/world",
-        contents="/world/**",
+        contents=contents if isinstance(contents, str) else list(contents),
         name=name,
         eye_controls=eye,
         overrides=overrides,

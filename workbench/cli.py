@@ -9,7 +9,6 @@ workbench itself. Everything heavy is imported inside the commands, so that help
 
 from __future__ import annotations
 
-import os
 import subprocess
 import sys
 import traceback
@@ -19,6 +18,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
+from workbench import cli_runs
 from workbench.terminal import (
     FAULT,
     IN_PART,
@@ -27,6 +27,7 @@ from workbench.terminal import (
     Bar,
     Bars,
     examples,
+    has_display,
     moment,
     print_error,
     print_json,
@@ -525,7 +526,7 @@ def view(
     Without a display the command that would open it is printed.
     """
     command = view_command(files_of(runs), web=web)
-    if not web and not _has_display():
+    if not web and not has_display():
         import shlex
 
         print("There is no display here. On a machine with one, with these files:", file=sys.stderr)
@@ -561,12 +562,6 @@ def view_command(files: Sequence[Path], *, web: bool) -> list[str]:
     """The command that opens the viewer on these files, reachable from this machine only."""
     command = [sys.executable, "-m", "rerun", *map(str, files), "--bind", "127.0.0.1"]
     return [*command, "--web-viewer"] if web else command
-
-
-def _has_display() -> bool:
-    if sys.platform != "linux":
-        return True
-    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
 # ----------------------------------------------------------------------------------- demo
@@ -832,6 +827,9 @@ def _one_of(text: str, known: Sequence[str], option: str) -> str:
     if text not in known:
         raise SettingsError(f"{option} {text}: must be one of {', '.join(known)}")
     return text
+
+
+cli_runs.add_to(app)
 
 
 # ----------------------------------------------------------------------------------- main

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import sys
 import threading
 import time
@@ -152,3 +153,10 @@ class Bars:
 def print_error(text: str) -> None:
     """Print one line about what went wrong, on stderr."""
     print(f"error: {shown(text, None)}", file=sys.stderr, flush=True)
+
+
+def has_display() -> bool:
+    """Whether there is a screen to open a window on."""
+    if sys.platform != "linux":
+        return True
+    return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
