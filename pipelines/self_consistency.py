@@ -49,8 +49,8 @@ class Reversed(Recording):
 
     Velocities and angular velocities change their sign, accelerations and poses stay. Samples of `held` streams are
     values that hold until the next one (a height, a scalar): each comes when, backward, its time begins, that is at
-    the time of the one after it; the last one comes first of all, 1 ns before `pivot_ns`. Memory holds `CHUNK` samples a stream; the times of
-    all samples are read once, in an own pass, 8 bytes each.
+    the time of the one after it; the last one comes first of all, 1 ns before `pivot_ns`. Memory holds `CHUNK` samples
+    a stream; the times of all samples are read once, in an own pass, 8 bytes each.
 
     Args:
         inner: the recording.

@@ -169,19 +169,19 @@ def test_velocities_turn_round_and_accelerations_stay() -> None:
 
 
 def test_forward_and_backward_agree_on_a_clean_mission_and_name_the_frame_of_an_error() -> None:
-    mission = eight("frames=60")
+    mission = eight("frames=40")
     chosen = settings(mission)
     forward = odometry(mission, chosen)
     back = Reversed(mission, [IMAGES])
     backward = odometry(back, chosen)
     clean = forward_backward(forward, backward, back.pivot_ns)
-    assert len(clean.index) == 59
+    assert len(clean.index) == 39
     assert np.abs(clean.increment_error[:, :2]).max() < 0.02 * mission.metres_per_px * 5
     assert np.hypot(*clean.end_error_m) < 1e-3
-    jumped = Trajectory(forward.t_ns, with_error(forward.pose, 33, np.array([0.0, 0.01, 0.0])))
+    jumped = Trajectory(forward.t_ns, with_error(forward.pose, 23, np.array([0.0, 0.01, 0.0])))
     found = forward_backward(jumped, backward, back.pivot_ns)
-    assert found.index[found.ranked()[0]] == 33
-    assert found.increment_error[32, 1] == pytest.approx(0.01, abs=1e-4)
+    assert found.index[found.ranked()[0]] == 23
+    assert found.increment_error[22, 1] == pytest.approx(0.01, abs=1e-4)
     assert found.residual_m < 1e-9
     turned = in_forward_time(backward, back.pivot_ns)
     np.testing.assert_array_equal(turned.t_ns, forward.t_ns)
@@ -257,7 +257,7 @@ def test_loops_measure_the_drift_of_the_chain_and_bracket_its_source(mounting_ya
         assert loop.share == pytest.approx(loop.drift_m / loop.revisit.loop_m)
     worst = suspects(loops)[0]
     assert worst.start <= 100 < worst.stop
-    assert worst.stop - worst.start < 40
+    assert worst.stop - worst.start < 60  # of 481
     assert worst.explained > 0.8
 
 
