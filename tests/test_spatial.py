@@ -14,6 +14,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from pipelines import evaluation as planar
 from pipelines.consistency import Consistency, band, nees_of
@@ -307,6 +308,7 @@ def test_consistency_of_right_and_of_overconfident_covariances() -> None:
     right = Consistency.of(np.append(squared, np.nan), 3)
     assert (right.consistent, right.count, right.expected) == (True, 500, 3.0)
     assert (right.low, right.high) == band(3, 500)
+    assert band(3, 500) == pytest.approx((chi2.ppf(0.025, 1500) / 500, chi2.ppf(0.975, 1500) / 500), rel=1e-12)
     proud = Consistency.of(nees_of(error, np.tile(covariance / 2, (500, 1, 1))), 3)
     assert not proud.consistent
     assert proud.ratio == pytest.approx(2 * right.ratio)
