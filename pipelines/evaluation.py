@@ -7,7 +7,7 @@ Association interpolates the reference at the estimate's times. The absolute err
 least-squares alignment in the plane (S. Umeyama, IEEE PAMI 13(4), 1991, reduced to two dimensions, where the
 rotation has a closed form). The relative error (RPE) compares motions over a distance or a time, as
 J. Sturm et al. (IROS 2012) define it. The drift is the error of the last pose after the first poses were laid
-over one another, as a share of the reference's path.
+over one another, as a share of the reference's path. NEES weighs errors by the estimate's own covariances.
 """
 
 from __future__ import annotations

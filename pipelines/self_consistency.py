@@ -15,6 +15,7 @@ from __future__ import annotations
 import dataclasses
 import heapq
 import math
+from array import array
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from itertools import pairwise
@@ -77,10 +78,10 @@ class Reversed(Recording):
     ) -> None:
         self.path, self.format, self.notes = inner.path, f"{inner.format}, backward", inner.notes
         self._inner, self._held = inner, frozenset(held)
-        times: dict[str, list[int]] = {name: [] for name in streams}
+        times = {name: array("q") for name in streams}
         for sample in inner.read(list(streams), start_ns, stop_ns):
             times[sample.stream].append(sample.t_ns)
-        self._times = {name: np.unique(np.array(t, dtype=np.int64)) for name, t in times.items()}
+        self._times = {name: np.unique(np.array(t)) for name, t in times.items()}
         if not any(map(len, self._times.values())):
             raise StreamError(f"{inner.path}: no sample of {', '.join(streams)} lies in the window to be read backward")
         self.pivot_ns = max(int(t[-1]) for t in self._times.values() if len(t))
