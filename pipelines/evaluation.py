@@ -7,7 +7,7 @@ Association interpolates the reference at the estimate's times. The absolute err
 least-squares alignment in the plane (S. Umeyama, IEEE PAMI 13(4), 1991, reduced to two dimensions, where the
 rotation has a closed form). The relative error (RPE) compares motions over a distance or a time, as
 J. Sturm et al. (IROS 2012) define it. The drift is the error of the last pose after the first poses were laid
-over one another, as a share of the reference's path.
+over one another, as a share of the reference's path. NEES weighs errors by the estimate's own covariances.
 """
 
 from __future__ import annotations
@@ -16,12 +16,13 @@ import dataclasses
 import math
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry import heading_of_quat, wrap_angle, wrap_angles
+from pipelines.consistency import nees_of
+from pipelines.geometry import heading_of_quat, rotated, wrap_angle, wrap_angles
 from readers.streams import PoseSample, WorkbenchError
 
 Floats = NDArray[np.float64]
@@ -191,10 +192,8 @@ def evaluate(
     Raises:
         EvaluationError: fewer than 2 poses, or fewer than half of them, have a reference.
     """
-    at = associate(estimate.t_ns, reference, offset_ns=offset_ns, method=method, max_gap_ns=max_gap_ns)
-    index = np.flatnonzero(np.isfinite(at[:, 0]))
-    _demand_enough(len(index), estimate, reference, offset_ns)
-    truth, raw = at[index], estimate.pose[index]
+    index, truth = associated(estimate, reference, offset_ns=offset_ns, method=method, max_gap_ns=max_gap_ns)
+    raw = estimate.pose[index]
     fitted = align(raw, truth, with_scale=True)
     alignment = fitted if with_scale else align(raw, truth)
     aligned = alignment(raw)
@@ -243,32 +242,67 @@ def associate(
     lie at most `max_gap_ns` apart (default: five of its median steps); nothing is extrapolated. ``nearest``
     takes the nearest pose, if it lies at most `max_gap_ns` away (default: half a median step).
     """
+    near = neighbours(t_ns + offset_ns, reference.t_ns, method, max_gap_ns)
     poses = np.full((len(t_ns), 3), np.nan)
-    known = reference.t_ns
-    if not len(known) or not len(t_ns):
-        return poses
-    usual = float(np.median(np.diff(known))) if len(known) > 1 else 0.0
-    times = t_ns + offset_ns
-    after = np.searchsorted(known, times).clip(0, len(known) - 1)
-    before = (after - 1).clip(0)
-    if method == "nearest":
-        near = np.where(np.abs(known[after] - times) <= np.abs(times - known[before]), after, before)
-        bound = usual / 2 if max_gap_ns is None else max_gap_ns
-        close = np.abs(known[near] - times) <= bound
-        poses[close] = reference.pose[near[close]]
-        return poses
-    before = np.where(known[after] == times, after, before)
-    gap = known[after] - known[before]
-    bound = GAP_STEPS * usual if max_gap_ns is None else max_gap_ns
-    inside = (known[before] <= times) & (times <= known[after]) & (gap <= bound)
-    share = np.where(gap > 0, (times - known[before]) / np.maximum(gap, 1), 0.0)
-    first, last = reference.pose[before], reference.pose[after]
+    index = np.flatnonzero(near.known)
+    first, last = reference.pose[near.before[index]], reference.pose[near.after[index]]
+    share = near.share[index, None]
     step = last - first
     step[:, 2] = wrap_angles(step[:, 2])
     # a known heading must not be lost to an unknown neighbour that has no weight
-    between = np.where(share[:, None] == 0, first, first + share[:, None] * step)
-    poses[inside] = between[inside]
+    poses[index] = np.where(share == 0, first, first + share * step)
     return poses
+
+
+class Neighbours(NamedTuple):
+    """Where times lie among known ones, all [n]: row before, row after, share of the way; whether that counts."""
+
+    before: NDArray[np.int64]
+    after: NDArray[np.int64]
+    share: Floats
+    known: NDArray[np.bool_]
+
+
+def neighbours(t_ns: Times, known_ns: Times, method: Method, max_gap_ns: int | None) -> Neighbours:
+    """The rows of ascending times `known_ns` [m] that stand for the times `t_ns` [n]; rules as for `associate`.
+
+    For ``nearest`` both rows are the nearest one and the share is 0.
+    """
+    if not len(known_ns) or not len(t_ns):
+        none = np.zeros(len(t_ns), dtype=np.int64)
+        return Neighbours(none, none, none.astype(np.float64), none.astype(np.bool_))
+    usual = float(np.median(np.diff(known_ns))) if len(known_ns) > 1 else 0.0
+    after = np.searchsorted(known_ns, t_ns).clip(0, len(known_ns) - 1)
+    before = (after - 1).clip(0)
+    if method == "nearest":
+        near = np.where(np.abs(known_ns[after] - t_ns) <= np.abs(t_ns - known_ns[before]), after, before)
+        bound = usual / 2 if max_gap_ns is None else max_gap_ns
+        return Neighbours(near, near, np.zeros(len(t_ns)), np.abs(known_ns[near] - t_ns) <= bound)
+    before = np.where(known_ns[after] == t_ns, after, before)
+    gap = known_ns[after] - known_ns[before]
+    bound = GAP_STEPS * usual if max_gap_ns is None else max_gap_ns
+    inside = (known_ns[before] <= t_ns) & (t_ns <= known_ns[after]) & (gap <= bound)
+    share = np.where(gap > 0, (t_ns - known_ns[before]) / np.maximum(gap, 1), 0.0)
+    return Neighbours(before, after, share, inside)
+
+
+def associated(
+    estimate: Trajectory,
+    reference: Trajectory,
+    *,
+    offset_ns: int = 0,
+    method: Method = "interpolate",
+    max_gap_ns: int | None = None,
+) -> tuple[NDArray[np.int64], Floats]:
+    """Which poses [m] of the estimate have a reference at their time, and that reference [m, 3]; see `associate`.
+
+    Raises:
+        EvaluationError: fewer than 2 poses, or fewer than half of them, have one.
+    """
+    at = associate(estimate.t_ns, reference, offset_ns=offset_ns, method=method, max_gap_ns=max_gap_ns)
+    index = np.flatnonzero(np.isfinite(at[:, 0]))
+    demand_enough(len(index), estimate.t_ns, reference.t_ns, offset_ns)
+    return index, at[index]
 
 
 def align(estimate: Floats, reference: Floats, *, with_scale: bool = False) -> Alignment:
@@ -311,6 +345,41 @@ def end_point_error(estimate: Floats, reference: Floats, whole: Alignment) -> fl
     return math.hypot(last[0] - reference[-1, 0], last[1] - reference[-1, 1])
 
 
+def pose_nees(
+    estimate: Trajectory,
+    covariance: Floats,
+    reference: Trajectory,
+    *,
+    offset_ns: int = 0,
+    method: Method = "interpolate",
+    max_gap_ns: int | None = None,
+) -> tuple[NDArray[np.int64], Floats]:
+    """NEES of poses in the plane: which poses [m] have a reference, and eᵀ P⁻¹ e of them [m].
+
+    Errors are those after `align_start`, turned back into the axes of the estimate's world, in which `covariance`
+    [n, 3, 3] of x, y, heading (m², m·rad, rad²) since the start is given. NaN where it is not known, or not positive
+    definite, as at the start itself. Of a right estimator each is χ² with 3 degrees of freedom
+    (`pipelines.consistency.Consistency`), but those along one path are not independent of one another.
+
+    Raises:
+        EvaluationError: fewer than 2 poses, or fewer than half of them, have a reference.
+        ValueError: there is not one covariance for each pose.
+    """
+    if covariance.shape != (len(estimate), 3, 3):
+        raise ValueError(f"covariances of shape {covariance.shape} for {len(estimate)} poses: [n, 3, 3] is needed")
+    index, truth = associated(estimate, reference, offset_ns=offset_ns, method=method, max_gap_ns=max_gap_ns)
+    raw = estimate.pose[index]
+    start = align_start(raw, truth, align(raw, truth))
+    x, y, _, heading = _errors(start(raw), truth).T
+    back = np.full(len(index), -start.rotation_rad)
+    error = np.column_stack([rotated(np.column_stack([x, y]), back), heading])
+    nees = np.full(len(index), np.nan)
+    known = np.isfinite(covariance[index]).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
+    known[known] = np.linalg.eigvalsh(covariance[index][known])[:, 0] > 0
+    nees[known] = nees_of(error[known], covariance[index][known])
+    return index, nees
+
+
 def relative_error(estimate: Floats, reference: Floats, along: Floats, delta: float, unit: str) -> Relative:
     """Error of the motion from every pose to the first one that is `delta` further `along` [n] (ascending).
 
@@ -323,7 +392,7 @@ def relative_error(estimate: Floats, reference: Floats, along: Floats, delta: fl
     i, j = start[pairs], stop[pairs]
     headings = bool(np.isfinite(reference[:, 2]).all() and np.isfinite(estimate[:, 2]).all())
     if headings:
-        q, p = _motion(reference, i, j), _motion(estimate, i, j)
+        q, p = motions(reference, i, j), motions(estimate, i, j)
         translation = np.hypot(p[:, 0] - q[:, 0], p[:, 1] - q[:, 1])
         turn = wrap_angles(p[:, 2] - q[:, 2])
     else:
@@ -338,6 +407,13 @@ def relative_error(estimate: Floats, reference: Floats, along: Floats, delta: fl
     )
 
 
+def motions(pose: Floats, i: NDArray[np.intp], j: NDArray[np.intp]) -> Floats:
+    """Motions pose_i⁻¹ pose_j [m, 3] in the frame of pose i."""
+    dx, dy = (pose[j, :2] - pose[i, :2]).T
+    c, s = np.cos(pose[i, 2]), np.sin(pose[i, 2])
+    return np.column_stack([c * dx + s * dy, c * dy - s * dx, pose[j, 2] - pose[i, 2]])
+
+
 def path_lengths(positions: Floats) -> Floats:
     """Length of the path from the first position to each one [n], of positions [n, 2]."""
     steps = np.hypot(*np.diff(positions, axis=0).T)
@@ -350,20 +426,25 @@ def round_down(value: float) -> float:
     return max(factor * power for factor in (1, 2, 5) if factor * power <= value * (1 + 1e-12))
 
 
-def _demand_enough(matched: int, estimate: Trajectory, reference: Trajectory, offset_ns: int) -> None:
-    if matched >= 2 and matched >= SMALLEST_SHARE * len(estimate):
+def demand_enough(matched: int, estimate_ns: Times, reference_ns: Times, offset_ns: int) -> None:
+    """See to it that enough poses have a reference.
+
+    Raises:
+        EvaluationError: fewer than 2 poses of the estimate, or fewer than half of them, are `matched`.
+    """
+    if matched >= 2 and matched >= SMALLEST_SHARE * len(estimate_ns):
         return
     raise EvaluationError(
-        f"{matched} of {len(estimate)} poses have a reference at their time (estimate {_span(estimate)}, "
-        f"reference {_span(reference)}, offset {offset_ns / 1e9:g} s); at least 2 and half of them are needed: "
+        f"{matched} of {len(estimate_ns)} poses have a reference at their time (estimate {_span(estimate_ns)}, "
+        f"reference {_span(reference_ns)}, offset {offset_ns / 1e9:g} s); at least 2 and half of them are needed: "
         "look at the reference's clock and units, or choose another reference"
     )
 
 
-def _span(path: Trajectory) -> str:
-    if not len(path):
+def _span(t_ns: Times) -> str:
+    if not len(t_ns):
         return "is empty"
-    return f"from {path.t_ns[0] / 1e9:.3f} to {path.t_ns[-1] / 1e9:.3f} s"
+    return f"from {t_ns[0] / 1e9:.3f} to {t_ns[-1] / 1e9:.3f} s"
 
 
 def _errors(estimate: Floats, reference: Floats) -> Floats:
@@ -382,13 +463,6 @@ def _growth(angles_rad: Floats) -> float:
     """How far an angle has turned from the first known value to the last one, whole turns included."""
     known = np.unwrap(angles_rad[np.isfinite(angles_rad)])
     return float(known[-1] - known[0]) if len(known) else math.nan
-
-
-def _motion(pose: Floats, i: NDArray[np.intp], j: NDArray[np.intp]) -> Floats:
-    """Motions pose_i⁻¹ pose_j [m, 3] in the frame of pose i."""
-    dx, dy = (pose[j, :2] - pose[i, :2]).T
-    c, s = np.cos(pose[i, 2]), np.sin(pose[i, 2])
-    return np.column_stack([c * dx + s * dy, c * dy - s * dx, pose[j, 2] - pose[i, 2]])
 
 
 def _distance(pose: Floats, i: NDArray[np.intp], j: NDArray[np.intp]) -> Floats:

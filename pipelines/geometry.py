@@ -23,6 +23,13 @@ def wrap_angles(angles_rad: Floats) -> Floats:
     return (angles_rad + np.pi) % (2 * np.pi) - np.pi
 
 
+def rotated(vectors: Floats, angle_rad: Floats) -> Floats:
+    """Plane vectors [n, 2], each turned counter-clockwise by its angle [n]."""
+    c, s = np.cos(angle_rad), np.sin(angle_rad)
+    x, y = vectors.T
+    return np.column_stack([c * x - s * y, s * x + c * y])
+
+
 def heading_of_quat(quat_xyzw: Floats) -> float:
     """Heading (rotation about z, counter-clockwise) of a unit quaternion [4]; NaN stays NaN."""
     x, y, z, w = (float(q) for q in quat_xyzw)

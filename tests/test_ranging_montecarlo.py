@@ -6,6 +6,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from pipelines.consistency import band
 from pipelines.ranging import montecarlo as mc
 from pipelines.ranging.inputs import Synchronisation, intervals
 from pipelines.ranging.montecarlo import Scenario, cramer_rao, run
@@ -77,7 +78,7 @@ def test_bound_is_that_of_the_study() -> None:
 
 def test_bands_hold_the_means() -> None:
     found = run(Scenario(runs=2000, pixel_sigma=0.1))
-    low, high = mc.band(3, 2000)
+    low, high = band(3, 2000)
     assert (low, high) == (pytest.approx(2.89, abs=0.01), pytest.approx(3.11, abs=0.01))
     nees = found.nees[:, 20:].mean(axis=0)
     assert np.mean((nees > low) & (nees < high)) > 0.7

@@ -14,8 +14,8 @@ from typing import TYPE_CHECKING, Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from pipelines.consistency import band
 from pipelines.lens import undistorted
 from pipelines.ranging.filter import Outcome, Status
 from pipelines.ranging.landmarks.frames import seen_px
@@ -227,8 +227,7 @@ class RangeAccount:
         """Mean NIS, what is expected of a right filter, and the band in which it would lie."""
         count = sum(life.updates for life in lives)
         mean = sum(life.nis for life in lives) / count if count else math.nan
-        ends = [(1 - BAND) / 2, (1 + BAND) / 2]
-        low, high = (float(chi2.ppf(end, self._degrees * count)) / count if count else math.nan for end in ends)
+        low, high = band(self._degrees, count, BAND)
         return {"mean": mean, "expected": float(self._degrees), "low": low, "high": high, "count": count}
 
     def _one(self, number: int, life: Life) -> dict[str, Any]:

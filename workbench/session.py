@@ -48,6 +48,7 @@ from workbench import inputs, range_inputs
 from workbench.range_account import RangeAccount
 from workbench.settings import Plugin, Resolved, SettingsError, plugin, resolve, settings_values, to_toml
 from workbench.summary import Tally, evaluation_values, lines, suitability
+from workbench.trajectory_files import tum_line_in_plane
 
 PACKAGES = ("estimator-workbench", "rerun-sdk", "numpy", "numba", "scipy", "opencv-python-headless", "rosbags", "mcap")
 FORMAT = 1
@@ -617,7 +618,7 @@ class _Session:
         span.add(step)
         pose = getattr(step, "pose", None)
         if tum is not None and pose is not None:
-            tum.write(tum_line(step.t_ns, pose))
+            tum.write(tum_line_in_plane(step.t_ns, pose))
 
     def _expected(self) -> int | None:
         """How many frames there will be, as far as the recording says it."""
@@ -787,13 +788,6 @@ def calibration(settings: Any, evaluation: Evaluation) -> dict[str, Any]:
         advice = "not to be used: the two do not agree, so that the path's shape is wrong, not only its scale"
     sentence = f"{key} = {fit:.6g} by least squares, {ratio:.6g} by path length; {advice}"
     return found | {"sentence": sentence}
-
-
-def tum_line(t_ns: int, pose: Floats) -> str:
-    """One line of a TUM trajectory: time (s), x, y, z (m), quaternion x, y, z, w of a pose in the plane."""
-    x, y, heading = (float(v) for v in pose)
-    seconds, rest = divmod(t_ns, inputs.SECOND_NS)
-    return f"{seconds}.{rest:09d} {x:.9f} {y:.9f} 0 0 0 {math.sin(heading / 2):.9f} {math.cos(heading / 2):.9f}\n"
 
 
 def versions() -> dict[str, str]:

@@ -14,8 +14,8 @@ from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.stats import chi2
 
+from pipelines.consistency import nees_of
 from pipelines.ranging import equations as eq
 from pipelines.ranging import joint, kernels, smoother
 from pipelines.ranging.filter import UPPER, Inputs, full_covariance
@@ -208,18 +208,6 @@ class Runs:
         """First time at which the mean error is below 10 % of the range, s; inf for never."""
         below = np.flatnonzero(self.mean_abs_error_m < CONVERGED / self.truth[..., 2].mean(axis=0))
         return float(self.time_s[below[0]]) if len(below) else math.inf
-
-
-def nees_of(error: Floats, covariance: Floats) -> Floats:
-    """eᵀ P⁻¹ e of errors [..., k] and covariances [..., k, k]."""
-    return np.asarray((error * np.linalg.solve(covariance, error[..., None])[..., 0]).sum(axis=-1))
-
-
-def band(degrees: int, samples: int, confidence: float = 0.95) -> tuple[float, float]:
-    """Between which the mean of `samples` values of χ² with `degrees` lies: the bands of NEES and NIS."""
-    tail = (1.0 - confidence) / 2
-    low, high = (float(chi2.ppf(p, degrees * samples)) / samples for p in (tail, 1.0 - tail))
-    return low, high
 
 
 def true_states(scenario: Scenario) -> Floats:

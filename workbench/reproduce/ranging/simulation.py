@@ -13,6 +13,7 @@ from typing import Any, Literal
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.consistency import band
 from pipelines.ranging import montecarlo as mc
 from pipelines.ranging.inputs import Synchronisation
 from pipelines.ranging.montecarlo import Runs, Scenario, cramer_rao, run
@@ -241,8 +242,8 @@ def consistency(runs: int, tick: Tick) -> Consistency:
     return Consistency(
         runs=runs,
         time_s=curve(found.time_s),
-        nees_band=mc.band(3, runs),
-        nis_band=mc.band(2, runs),
+        nees_band=band(3, runs),
+        nis_band=band(2, runs),
         rows=tuple(rows),
     )
 

@@ -1,0 +1,194 @@
+"""The offset between two trajectories' clocks, from their speeds: a pipeline's answer to unsynchronised logs.
+
+Speeds do not depend on the frame in which a path is given, nor on where it starts, so that they can be compared before
+any alignment. Both are taken over the same stretch of time, T = 2 `half_window_s`: s(t) = |p(t + T/2) -
+p(t - T/2)|/T. The lag with the highest normalised correlation is found over a raster, and refined by Gauss-Newton
+on Σ (s_ref(t + τ) - k s_est(t) - b)² in the lag τ, the scale k and the offset b of the speeds. Its standard deviation
+is that of the sum Σ slope · residual, the correlation of its terms over time included (a sandwich estimate).
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+from typing import NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.evaluation import Floats, Trajectory
+
+SECOND_NS = 1_000_000_000
+LEAST_CORRELATION = 0.5
+"""Below this the speeds are not those of one motion."""
+HALF_WINDOW_S = 0.5
+"""Half the time over which speeds are taken: longer than the noise of positions, shorter than changes of speed."""
+COARSE = 4
+"""Lags that are looked at per half window, before the best one is refined."""
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class TimeOffset:
+    """The offset that is to be added to the estimate's times, and what is known of it.
+
+    `offset_ns` goes where `evaluate` takes its own of that name; `sigma_s` is its standard deviation, `correlation`
+    that of the speeds at that offset, `scale` the reference's speed over the estimate's. `determined` is False,
+    with a `reason`, where the speeds do not tell the offset.
+    """
+
+    offset_ns: int
+    sigma_s: float
+    correlation: float
+    scale: float
+    determined: bool
+    reason: str = ""
+
+
+def time_offset(
+    estimate: Trajectory,
+    reference: Trajectory,
+    *,
+    max_offset_s: float = 10.0,
+    around_s: float = 0.0,
+    half_window_s: float | None = None,
+) -> TimeOffset:
+    """Estimate the offset between the clocks of two trajectories of one motion.
+
+    Args:
+        estimate: the path whose times are to be moved; its scale may be unknown.
+        reference: the path whose times stay.
+        max_offset_s: how far from `around_s` the offset is looked for.
+        around_s: offset that is expected.
+        half_window_s: half the time over which speeds are taken; None for half a second, and at least two median steps
+            of the slower path.
+
+    Raises:
+        ValueError: `max_offset_s` or `half_window_s` is not positive.
+    """
+    if not max_offset_s > 0 or (half_window_s is not None and not half_window_s > 0):
+        raise ValueError("max_offset_s and half_window_s must be positive")
+    if min(len(estimate), len(reference)) < 3:
+        return _unknown("one of the paths has fewer than 3 poses")
+    steps = [float(np.median(np.diff(path.t_ns))) / SECOND_NS for path in (estimate, reference)]
+    half = max(HALF_WINDOW_S, 2 * max(steps)) if half_window_s is None else half_window_s
+    origin = int(estimate.t_ns[0])
+    moved, truth = _Speed(estimate, origin, half), _Speed(reference, origin, half)
+    raster = half / COARSE
+    t = np.arange(moved.first, moved.last, raster)
+    reach = math.ceil(max_offset_s / raster)
+    lags = around_s + np.arange(-reach, reach + 1) * raster
+    found = _correlations(moved.at(t), truth, t, lags, raster)
+    if not np.isfinite(found).any():
+        return _unknown("the two paths have too little time in common within the offsets that are looked at")
+    best = int(np.nanargmax(found))
+    if found[best] < LEAST_CORRELATION:
+        return _unknown(f"the speeds do not go together: their correlation is {found[best]:.2f} at best")
+    if best in (0, len(lags) - 1):
+        return _unknown("the best offset lies at the border of those that are looked at")
+    return _refined(moved, truth, np.arange(moved.first, moved.last, min(steps)), float(lags[best]))
+
+
+class _Speed:
+    """Speeds of a path over a window of time; times in seconds from an origin."""
+
+    def __init__(self, path: Trajectory, origin_ns: int, half_s: float) -> None:
+        self._t = (path.t_ns - origin_ns) / SECOND_NS
+        self._place, self.half = path.pose[:, :2], half_s
+        self.first, self.last = self._t[0] + half_s, self._t[-1] - half_s
+
+    def at(self, t: Floats) -> Floats:
+        """Speeds at times [n], NaN where the window leaves the path."""
+        ends = [
+            np.column_stack([np.interp(t + side, self._t, axis) for axis in self._place.T])
+            for side in (-self.half, self.half)
+        ]
+        speed = np.hypot(*(ends[1] - ends[0]).T) / (2 * self.half)
+        speed[(t < self.first) | (t > self.last)] = np.nan
+        return np.asarray(speed)
+
+
+def _correlations(
+    moved: Floats, truth: _Speed, t: NDArray[np.floating], lags: NDArray[np.floating], raster: float
+) -> Floats:
+    """Normalised correlation at each lag [m], NaN where less than half of the shorter path takes part."""
+    long = truth.at(np.arange(len(t) + len(lags) - 1) * raster + t[0] + lags[0])
+    known = np.isfinite(long)
+    least = min(len(t), int(known.sum())) / 2
+    result = np.full(len(lags), np.nan)
+    for k in range(len(lags)):
+        part = known[k : k + len(t)]
+        if part.sum() < max(least, 10):
+            continue
+        a, b = moved[part], long[k : k + len(t)][part]
+        a, b = a - a.mean(), b - b.mean()
+        strength = math.sqrt(float(a @ a) * float(b @ b))
+        if strength > 0:
+            result[k] = float(a @ b) / strength
+    return result
+
+
+def _refined(moved: _Speed, truth: _Speed, t: Floats, coarse: float) -> TimeOffset:
+    """Gauss-Newton on the lag; scale and offset of the speeds are fitted anew for every lag."""
+    lag = coarse
+    for _ in range(30):
+        fit = _fit(moved, truth, t, lag)
+        size = float(fit.slope @ fit.slope)
+        change = float(fit.slope @ fit.residual) / size if size > 0 else math.inf
+        lag += max(-truth.half / COARSE, min(change, truth.half / COARSE))
+        if abs(change) < 1e-9:
+            break
+        if abs(lag - coarse) > truth.half:
+            return _unknown("the speeds change too little to tell the offset")
+    # what speeds over a window have in common makes neighbours count as one
+    pull = fit.slope * fit.residual
+    variance = float(pull @ pull) * max(_correlated(pull), 1.0) / size**2
+    return TimeOffset(
+        offset_ns=round(lag * SECOND_NS),
+        sigma_s=math.sqrt(variance),
+        correlation=fit.correlation,
+        scale=fit.scale,
+        determined=True,
+    )
+
+
+class _Fit(NamedTuple):
+    """The fit s_ref(t + τ) = k s_est(t) + b at one lag τ: slope [n] of s_ref less what k and b explain of it."""
+
+    slope: Floats
+    residual: Floats
+    scale: float
+    correlation: float
+
+
+def _fit(moved: _Speed, truth: _Speed, t: Floats, lag: float) -> _Fit:
+    # over the window of the speeds itself: over less, the slope would be that of the noise
+    early, late = (truth.at(t + lag + side * truth.half) for side in (-1, 1))
+    a, b, slope = moved.at(t), truth.at(t + lag), (late - early) / (2 * truth.half)
+    use = np.isfinite(a) & np.isfinite(b) & np.isfinite(slope)
+    linear = np.column_stack([a[use], np.ones(int(use.sum()))])
+    (scale, offset), along = (np.linalg.lstsq(linear, y[use], rcond=None)[0] for y in (b, slope))
+    return _Fit(
+        slope=slope[use] - linear @ along,
+        residual=linear @ np.array([scale, offset]) - b[use],
+        scale=float(scale),
+        correlation=float(np.corrcoef(a[use], b[use])[0, 1]),
+    )
+
+
+def _correlated(values: Floats) -> float:
+    """How many neighbouring values count as one: 1 + 2 Σ ρ, up to the first autocorrelation below zero."""
+    n = len(values)
+    spectrum = np.fft.rfft(values - values.mean(), 2 * n)
+    auto = np.fft.irfft(np.abs(spectrum) ** 2)[: n // 2]
+    if not auto[0] > 0:
+        return 1.0
+    rho = auto / auto[0]
+    negative = np.flatnonzero(rho < 0)
+    stop = int(negative[0]) if len(negative) else len(rho)
+    return float(1 + 2 * rho[1:stop].sum())
+
+
+def _unknown(reason: str) -> TimeOffset:
+    return TimeOffset(
+        offset_ns=0, sigma_s=math.nan, correlation=math.nan, scale=math.nan, determined=False, reason=reason
+    )
