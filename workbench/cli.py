@@ -632,12 +632,12 @@ app.add_typer(reproduce, name="reproduce", short_help="Repeat a paper's experime
         "workbench reproduce paper-a --seeds 5",
         "workbench reproduce paper-a --matrix --limits",
         "workbench reproduce paper-a --surface floor.png --frames 600 -o results/floor",
-        "workbench reproduce paper-a --set fragment_side_px=21 -o results/paper-a-21",
+        "workbench reproduce paper-a --set fragment_side_px=21 -o results/reproduce-paper-a-21",
     ),
 )
 def reproduce_paper_a(
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of the results.")] = Path(
-        "results/paper-a"
+        "results/reproduce-paper-a"
     ),
     surface: Annotated[
         str | None, typer.Option(metavar="NAME|PICTURE", help="The ground [gravel; all for matrix and limits].")
@@ -739,7 +739,7 @@ def _print_statements(statements: Iterable[Statement], unfinished: Iterable[str]
 )
 def reproduce_paper_b(
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of the results.")] = Path(
-        "results/paper-b"
+        "results/reproduce-paper-b"
     ),
     runs: Annotated[int, typer.Option(metavar="N", help="Runs of each Monte Carlo; the paper has 1000.")] = 4000,
     seeds: Annotated[int, typer.Option(metavar="N", help="Runs of the robot's replica.")] = 40,
@@ -747,8 +747,8 @@ def reproduce_paper_b(
 ) -> None:
     """Repeat paper B's Tables 1-3 and Figs 6-8, 10-12 beside the paper's numbers, with bounds and consistency.
 
-    The folder then holds report.md with tables and pictures, and the same values as JSON and CSV. Ctrl-C leaves
-    the finished parts; the same command goes on with the others.
+    The folder then holds report.md with tables and pictures, the same values as JSON and CSV, and a log of one run
+    of the robot for the viewer. Ctrl-C leaves the finished parts; the same command goes on with the others.
     """
     import shlex
 
@@ -774,6 +774,8 @@ def _print_ranges(done: paper_b.Reproduced) -> None:
     for name, (heads, rows) in report.tables(done.results).items():
         print("\n".join((name, *table(heads, rows))), end="\n\n")
     _print_statements(statements(done.results), done.results.unfinished, done.file)
+    if done.results.robot:
+        print(f"log     workbench view {done.results.log}")
 
 
 # ------------------------------------------------------------------------------- settings

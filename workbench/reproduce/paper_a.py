@@ -30,7 +30,7 @@ class Plan:
     `overrides` are ``key=value`` over the preset paper-a; `samples` are the fragments of a cell of the limits.
     """
 
-    out: Path = Path("results/paper-a")
+    out: Path
     surface: str | None = None
     frames: int = FRAMES
     seeds: int = 1

@@ -11,8 +11,7 @@ from typing import Any
 
 from workbench import scenarios
 from workbench.reproduce.documents import made_folder
-from workbench.reproduce.ranging import report
-from workbench.reproduce.ranging import robot as replica
+from workbench.reproduce.ranging import replica, report, robot
 from workbench.reproduce.ranging import simulation as sim
 from workbench.reproduce.ranging.parts import Part
 from workbench.reproduce.ranging.results import Results
@@ -30,7 +29,7 @@ FEWEST_RUNS, FEWEST_SEEDS = 10, 1
 class Plan:
     """What is to be done: `runs` of each Monte Carlo, `seeds` runs of the robot."""
 
-    out: Path = Path("results/paper-b")
+    out: Path
     runs: int = RUNS
     seeds: int = SEEDS
     command: str = "workbench reproduce paper-b"
@@ -48,13 +47,14 @@ class Reproduced:
 
 @dataclass(frozen=True, slots=True)
 class Work:
-    """One part: what it is called, what makes it, how many ticks that takes, and what it depends on."""
+    """One part: what it is called, what makes it, how many ticks that takes, what it depends on, its files."""
 
     name: str
     kind: type[Part]
     make: Task[Part]
     ticks: int
     depends: dict[str, Any]
+    files: tuple[Path, ...] = ()
 
 
 def works(plan: Plan) -> list[Work]:
@@ -72,9 +72,14 @@ def works(plan: Plan) -> list[Work]:
         )
     ]
     scenario = scenarios.load(replica.SCENARIO).scenario.model_dump(mode="json")
-    ticks = plan.seeds + min(plan.seeds, replica.WAYS_RUNS) + 2
-    depends = {"runs": plan.runs, "seeds": plan.seeds, "scenario": scenario}
-    made.append(Work("robot", replica.Robot, partial(replica.robot, plan.seeds, plan.runs), ticks, depends))
+    depends = {
+        "runs": plan.runs,
+        "seeds": plan.seeds,
+        "scenario": scenario,
+        "ways": robot.WAYS,
+    }
+    make = partial(robot.robot, plan.seeds, plan.runs, plan.out)
+    made.append(Work("robot", robot.Robot, make, robot.ticks(plan.seeds), depends, robot.log_files(plan.out)))
     return made
 
 
@@ -98,6 +103,7 @@ def reproduce(plan: Plan, on_progress: OnProgress) -> Reproduced:
         interrupted = True
     results = Results(
         command=plan.command,
+        log=robot.log_folder(plan.out),
         runs=plan.runs,
         seeds=plan.seeds,
         unfinished=[work.name for work in wanted if work.name not in found],
@@ -110,7 +116,7 @@ def _done(work: Work, folder: Path, on_progress: OnProgress) -> Part:
     """The part, from the folder or made now."""
     identity = json.dumps({"versions": versions(), **work.depends}, sort_keys=True, default=str)
     kept = work.kind.kept(folder, identity)
-    if kept is not None:
+    if kept is not None and all(file.is_file() for file in work.files):
         return kept
     (part,) = carried_out([work.make], jobs=1, on_tick=lambda done: on_progress(work.name, done, work.ticks))
     part.keep(folder, identity)
