@@ -24,9 +24,10 @@ import typer
 if TYPE_CHECKING:
     from pipelines.simulation.mission import SimulatedMission
     from readers.streams import Camera, ReadOptions, Recording, StreamInfo
-    from workbench.reproduce import paper_b
+    from workbench.reproduce import report as reports_a
     from workbench.reproduce.judged import Statement
-    from workbench.reproduce.paper_a import Reproduced
+    from workbench.reproduce.plans import Reproduced
+    from workbench.reproduce.ranging.results import Results as RangeResults
     from workbench.session import Outcome, Progress, Request
 
 REFUSED, IN_PART, INTERRUPTED, FAULT = 2, 3, 130, 1
@@ -672,11 +673,7 @@ def reproduce_paper_a(
     )
     with _Bars() as bars:
         done = paper_a.reproduce(plan, bars)
-    if as_json:
-        _print_json(report.values(done.results) | {"folder": str(done.folder), "interrupted": done.interrupted})
-    else:
-        _print_reproduced(done)
-    raise typer.Exit(INTERRUPTED if done.interrupted else 0)
+    _end_reproduced(done, report.values(done.results) if as_json else None, _print_reproduced)
 
 
 def _as_typed(
@@ -700,7 +697,16 @@ def _as_typed(
     return shlex.join(words)
 
 
-def _print_reproduced(done: Reproduced) -> None:
+def _end_reproduced(done: Reproduced[Any], values: Mapping[str, Any] | None, show: Callable[[Any], None]) -> NoReturn:
+    """Print the values of an experiment as JSON, or show it where there are none; and exit."""
+    if values is not None:
+        _print_json({**values, "folder": str(done.folder), "interrupted": done.interrupted})
+    else:
+        show(done)
+    raise typer.Exit(INTERRUPTED if done.interrupted else 0)
+
+
+def _print_reproduced(done: Reproduced[reports_a.Results]) -> None:
     """Print the tables and statements of an experiment for people."""
     from workbench.reproduce import report
 
@@ -759,14 +765,10 @@ def reproduce_paper_b(
     plan = paper_b.Plan(out=out, runs=runs, seeds=seeds, command=shlex.join(words))
     with _Bars() as bars:
         done = paper_b.reproduce(plan, bars)
-    if as_json:
-        _print_json(report.values(done.results) | {"folder": str(done.folder), "interrupted": done.interrupted})
-    else:
-        _print_ranges(done)
-    raise typer.Exit(INTERRUPTED if done.interrupted else 0)
+    _end_reproduced(done, report.values(done.results) if as_json else None, _print_ranges)
 
 
-def _print_ranges(done: paper_b.Reproduced) -> None:
+def _print_ranges(done: Reproduced[RangeResults]) -> None:
     """Print the tables and statements of paper B's experiments for people."""
     from workbench.reproduce.ranging import report
     from workbench.reproduce.ranging.statements import statements

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,16 +10,14 @@ from typing import Any
 
 from workbench import scenarios
 from workbench.reproduce.documents import made_folder
+from workbench.reproduce.plans import OnProgress, Reproduced, at_least
 from workbench.reproduce.ranging import replica, report, robot
 from workbench.reproduce.ranging import simulation as sim
 from workbench.reproduce.ranging.parts import Part
 from workbench.reproduce.ranging.results import Results
 from workbench.reproduce.tasks import Task, carried_out
 from workbench.session import versions
-from workbench.settings import SettingsError
 
-OnProgress = Callable[[str, int, int], None]
-"""Told what is being done, how many steps of it are done, and how many there are."""
 RUNS, SEEDS = 4000, 40
 FEWEST_RUNS, FEWEST_SEEDS = 10, 1
 
@@ -33,16 +30,6 @@ class Plan:
     runs: int = RUNS
     seeds: int = SEEDS
     command: str = "workbench reproduce paper-b"
-
-
-@dataclass(frozen=True, slots=True)
-class Reproduced:
-    """What came of it: the folder, the report, the results, and whether it was interrupted."""
-
-    folder: Path
-    file: Path
-    results: Results
-    interrupted: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +70,7 @@ def works(plan: Plan) -> list[Work]:
     return made
 
 
-def reproduce(plan: Plan, on_progress: OnProgress) -> Reproduced:
+def reproduce(plan: Plan, on_progress: OnProgress) -> Reproduced[Results]:
     """Do what is missing of the plan in its folder, and write the report.
 
     Finished parts are found again, so that the same call goes on after an interrupt.
@@ -91,9 +78,8 @@ def reproduce(plan: Plan, on_progress: OnProgress) -> Reproduced:
     Raises:
         WorkbenchError: the plan cannot be carried out; the text says why.
     """
-    for name, value, least in (("runs", plan.runs, FEWEST_RUNS), ("seeds", plan.seeds, FEWEST_SEEDS)):
-        if value < least:
-            raise SettingsError(f"--{name} {value}: must be {least} or more")
+    at_least("runs", plan.runs, FEWEST_RUNS)
+    at_least("seeds", plan.seeds, FEWEST_SEEDS)
     made_folder(plan.out)
     wanted, found, interrupted = works(plan), dict[str, Part](), False
     try:

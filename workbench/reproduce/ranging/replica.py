@@ -8,7 +8,7 @@ are carried along. The reference is the truth; the paper's own, perspective-n-po
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Generator, Iterable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple, Self
@@ -21,7 +21,7 @@ from pipelines.ranging.landmarks.settings import BoardSettings
 from pipelines.ranging.reference import of_chessboard
 from pipelines.ranging.sightings import Sighting
 from pipelines.ranging.step import RangeStep
-from pipelines.replay import replay
+from pipelines.replay import Replayed, replay
 from pipelines.simulation.mission import SimulatedMission
 from pipelines.simulation.scenario import FRONT_TRACKS, Scenario, landmarks_of
 from pipelines.simulation.sensors import Imu, Odometer, Tracks
@@ -122,7 +122,8 @@ def board_depths(found: Drive) -> Floats:
         of_board = sample.ids >= found.corner
         numbers = sample.ids[of_board] - found.corner
         seen = Sighting(numbers, sample.points_px[of_board], np.zeros(len(numbers)))
-        depths[k : k + 1] = of_chessboard(seen, settings, found.mission.camera).depth_m[numbers == 0]
+        for depth in of_chessboard(seen, settings, found.mission.camera).depth_m[numbers == 0]:
+            depths[k] = depth
     return depths
 
 
@@ -180,19 +181,23 @@ class Ranged(NamedTuple):
 
 def ranged(found: Drive, way: Way) -> Ranged:
     """The range filter over one drive."""
+    return Ranged.of((item.step for item in steps_of(found, way)), found.corner)
+
+
+def steps_of(found: Drive, way: Way) -> Generator[Replayed]:
+    """The range filter over one drive, step by step, with the streams and the camera that a replay chooses."""
     mission, estimator = found.mission, plugin("range")
     resolved = resolve(estimator, preset=way.preset, overrides=overrides(found, way))
     streams = range_inputs.choose_streams(mission, resolved.settings)
     camera = range_inputs.camera_of(mission, streams)
     resolved, _ = range_inputs.with_camera(resolved, mission, camera, streams)
-    steps = replay(
+    return replay(
         mission,
         estimator.build(resolved.settings),
         image_stream=streams.frames,
         other_streams=streams.others,
         stop_ns=found.stop_ns,
     )
-    return Ranged.of((item.step for item in steps), found.corner)
 
 
 def ranged_and_logged(found: Drive, way: Way, folder: Path) -> Ranged:

@@ -19,6 +19,7 @@ from workbench.reproduce.documents import (
     version_lines,
     write_csv,
     write_json,
+    write_report,
 )
 from workbench.reproduce.ranging import pictures
 from workbench.reproduce.ranging.replica import START_FACTOR
@@ -224,14 +225,11 @@ def tables(results: Results) -> dict[str, Table]:
 
 def write(results: Results, folder: Path) -> Path:
     """Write report.md, its pictures, values.json and the CSV files; returns the report."""
-    (folder / "pictures").mkdir(exist_ok=True)
     write_json(values(results), folder / "values.json")
     for name, (heads, rows) in tables(results).items():
         file = name.lower().replace(",", "").replace(":", "").replace(" ", "-")
         write_csv([dict(zip(_distinct(heads), row, strict=True)) for row in rows], folder / f"{file}.csv")
-    report = folder / "report.md"
-    report.write_text("\n".join(_lines(results, folder)) + "\n", encoding="utf-8")
-    return report
+    return write_report(_lines(results, folder), folder)
 
 
 def _distinct(heads: Any) -> list[str]:
