@@ -244,11 +244,12 @@ def test_the_log_is_that_of_a_replay(done: Reproduced[Results], folder: Path) ->
     read = replica.Ranged.of(rrd.read_steps(log / "best.rrd", "best", RangeStep), drive.corner)
     np.testing.assert_array_equal(read.depth_m, found.run.estimate_m)
     scenario = Path("sim:paper-b")
+    digest = inputs.digest_of(scenarios.open_scenario(scenario), scenario)
     for preset in ("best", "paper-b"):
         written = tomllib.loads((log / f"{preset}.toml").read_text())
         assert written["complete"]
         assert (log / f"{preset}.rrd").is_file()
-        assert written["run"]["digest"] == inputs.digest_of(scenarios.open_scenario(scenario), scenario)
+        assert written["run"]["digest"] == digest
         assert written["settings"]["start_range_m"] == pytest.approx(1.5 * drive.point_m[0, 2])
     assert "`workbench view`" in done.file.read_text()
 

@@ -263,8 +263,3 @@ def statuses(update: Update, *, max_relative_sigma: float = 0.1, min_parallax_px
     ):
         found[update.outcome == outcome] = status
     return np.asarray(found, dtype=np.int64)
-    before = np.zeros((*speed.shape[:-1], 1))
-    moved = way[..., window - 1 :] - np.concatenate([before, way[..., :-window]], axis=-1)
-    lasted = time[window - 1 :] - np.concatenate([[0.0], time[:-window]])
-    still[..., window - 1 :] = np.abs(moved) < sigmas * sigma_speed * np.sqrt(lasted)
-    return still
