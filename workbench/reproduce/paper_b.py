@@ -59,12 +59,7 @@ def works(plan: Plan) -> list[Work]:
         )
     ]
     scenario = scenarios.load(replica.SCENARIO).scenario.model_dump(mode="json")
-    depends = {
-        "runs": plan.runs,
-        "seeds": plan.seeds,
-        "scenario": scenario,
-        "ways": robot.WAYS,
-    }
+    depends = {"runs": plan.runs, "seeds": plan.seeds, "scenario": scenario, "ways": robot.WAYS}
     make = partial(robot.robot, plan.seeds, plan.runs, plan.out)
     made.append(Work("robot", robot.Robot, make, robot.ticks(plan.seeds), depends, robot.log_files(plan.out)))
     return made
