@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from pipelines.ranging import smoother
 from pipelines.ranging.filter import Outcome, Status
-from pipelines.ranging.range_filter import Pose, RangeFilter, RangeState
+from pipelines.ranging.range_filter import RangeFilter, RangeState
 from pipelines.ranging.range_settings import JOINT_LIMIT, MotionModel, RangeSettings
 from pipelines.ranging.robot_motion import Ride, noise_of
 from pipelines.ranging.settings import Flow, GainForm, Model, TransitionForm
@@ -45,13 +45,12 @@ class Life:
         born: number of its first frame in the log.
         mean: X̂ there [3].
         covariance: P there [3, 3].
+        path: what the filter said at every frame since, X one after another; it may go on after the last point.
         at: numbers of the frames with accepted image points.
         pixel: these points, x, y, one after another.
         variance: of their coordinates, px².
-        xi: what the filter said after these frames.
-        sigma_xi: its uncertainty.
+        sigma_xi: how sure the filter was of ξ after these frames.
         counted: 1 where its range counted.
-        told: X after the last of these frames [3].
         parallax_px: the largest derotated parallax.
     """
 
@@ -60,11 +59,10 @@ class Life:
     born: int
     mean: Floats
     covariance: Floats
-    told: Floats
+    path: array[float] = field(default_factory=lambda: array("d"))
     at: array[int] = field(default_factory=lambda: array("q"))
     pixel: array[float] = field(default_factory=lambda: array("d"))
     variance: array[float] = field(default_factory=lambda: array("d"))
-    xi: array[float] = field(default_factory=lambda: array("d"))
     sigma_xi: array[float] = field(default_factory=lambda: array("d"))
     counted: array[int] = field(default_factory=lambda: array("b"))
     parallax_px: float = 0.0
@@ -78,7 +76,6 @@ class MissionLog:
         self.frame, self.t_ns, self.upto = array("q"), array("q"), array("q")
         self._now: dict[int, Life] = {}
         self._dt, self._turns, self._shifts, self._still = array("d"), array("d"), array("d"), array("b")
-        self._poses = array("d")
 
     def take(self, step: RangeStep, state: RangeState) -> None:
         """Note one frame: what the filter told of it, and its state after it. Skipped frames are passed over."""
@@ -89,7 +86,6 @@ class MissionLog:
         self.frame.append(step.frame)
         self.t_ns.append(step.t_ns)
         self.upto.append(len(self._dt))
-        self._poses.extend([*state.pose.turn.ravel(), *state.pose.shift_m])
         sigma = dict(zip(state.sighting.ids[::-1].tolist(), state.sighting.sigma_px[::-1].tolist(), strict=True))
         for slot in np.flatnonzero(np.isfinite(step.landmark_id)).tolist():
             self._follow(step, slot, sigma)
@@ -104,7 +100,7 @@ class MissionLog:
         outcome, number = step.outcome[slot], int(step.landmark_id[slot])
         mean, covariance = step.mean[slot].copy(), step.covariance[slot].copy()
         if outcome in (Outcome.STARTED, Outcome.RESET):
-            self._now[slot] = Life(number, slot, len(self.frame) - 1, mean, covariance, mean)
+            self._now[slot] = Life(number, slot, len(self.frame) - 1, mean, covariance)
             self.lives.append(self._now[slot])
         elif outcome == Outcome.LOST:
             self._now.pop(slot, None)
@@ -113,16 +109,11 @@ class MissionLog:
             life.at.append(len(self.frame) - 1)
             life.pixel.extend(step.measured_px[slot])
             life.variance.append(sigma[number] ** 2)
-            life.xi.append(mean[2])
             life.sigma_xi.append(np.sqrt(covariance[2, 2]))
             life.counted.append(int(step.status[slot] == Status.CONVERGED))
-            life.told = mean
             life.parallax_px = max(life.parallax_px, np.nan_to_num(step.derotated_parallax_px[slot]))
-
-    def pose(self, at: int) -> Pose:
-        """Where the camera was at a frame, by dead reckoning."""
-        values = np.array(self._poses[12 * at : 12 * at + 12])
-        return Pose(values[:9].reshape(3, 3), values[9:])
+        if slot in self._now:
+            self._now[slot].path.extend(mean)
 
     def drive(self, settings: RangeSettings) -> Drive:
         """The way through all frames, with the speeds' noise of the settings."""
@@ -235,19 +226,18 @@ def _exact(settings: RangeSettings) -> Model:
 def _group(
     model: Model, drive: Drive, log: MissionLog, lives: list[Life], on_pass: Callable[[], None] | None
 ) -> Group:
-    known = _known(log, lives)
-    first, failed = known.mean.copy(), np.zeros(len(lives), np.int64)
-    first[:, 2] = [_depth_back(model, log, life) for life in lives]
-    left_out: list[Life] = []
-    while lives and (at := smoother.behind(model, drive, known, first)) >= 0:
+    known, about = _known(log, lives)
+    first, error = smoother.start_about(model, drive, known, about)
+    failed, left_out = np.zeros(len(lives), np.int64), list[Life]()
+    while lives and (at := smoother.behind(model, drive, known, first, error)) >= 0:
         first[at, 2] *= 0.5
         failed[at] += 1
         if failed[at] > HALVINGS:
             left_out.append(lives.pop(at))
-            first, failed, known = np.delete(first, at, 0), np.delete(failed, at), _known(log, lives)
+            first, failed, known = np.delete(first, at, 0), np.delete(failed, at), _known(log, lives)[0]
     if not lives:
         return Group([], left_out, 0, True)
-    found = smoother.most_probable(model, drive, known, first, on_pass=on_pass)
+    found = smoother.most_probable(model, drive, known, first, error, on_pass=on_pass)
     told = []
     for life, column in zip(lives, known.slot.tolist(), strict=True):
         frames = np.s_[life.born : life.at[-1] + 1, column]
@@ -255,15 +245,17 @@ def _group(
     return Group(told, left_out, found.iterations, found.converged)
 
 
-def _known(log: MissionLog, lives: list[Life]) -> Lives:
-    """The lives as the smoother takes them; their slots side by side."""
+def _known(log: MissionLog, lives: list[Life]) -> tuple[Lives, Floats]:
+    """The lives as the smoother takes them, their slots side by side; and the filter's path [F, N, 3]."""
     column = {slot: place for place, slot in enumerate(sorted({life.slot for life in lives}))}
     pixel = np.full((len(log.frame), len(column), 2), np.nan)
-    variance = np.ones(pixel.shape[:2])
+    variance, about = np.ones(pixel.shape[:2]), np.full((*pixel.shape[:2], 3), np.nan)
     for life in lives:
         pixel[life.at, column[life.slot]] = np.array(life.pixel).reshape(-1, 2)
         variance[life.at, column[life.slot]] = life.variance
-    return Lives(
+        path = np.array(life.path).reshape(-1, 3)
+        about[life.born : life.born + len(path), column[life.slot]] = path
+    known = Lives(
         slot=np.array([column[life.slot] for life in lives], dtype=np.int64),
         born=np.array([life.born for life in lives], dtype=np.int64),
         last=np.array([life.at[-1] for life in lives], dtype=np.int64),
@@ -272,15 +264,4 @@ def _known(log: MissionLog, lives: list[Life]) -> Lives:
         pixel=pixel,
         variance=variance,
     )
-
-
-def _depth_back(model: Model, log: MissionLog, life: Life) -> float:
-    """ξ at the start of a life by what the filter knew at its end, P_0 = R (P - s) + s_0; if that fails, as started.
-
-    With P = r/ξ everything is multiplied by ξ, so that ξ = 0 is no matter.
-    """
-    begin, end = log.pose(life.born), log.pose(life.at[-1])
-    x, y, xi = life.told
-    ray = np.array([(x - model.centre_x_px) / model.focal_px, (y - model.centre_y_px) / model.focal_px, 1.0])
-    back = begin.turn @ end.turn.T @ (ray - xi * end.shift_m) + xi * begin.shift_m
-    return float(xi / back[2]) if back[2] > 0.0 else float(life.mean[2])
+    return known, about

@@ -18,7 +18,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 from numba import njit
@@ -174,20 +174,20 @@ def most_probable(
     drive: Drive,
     lives: Lives,
     first: Floats,
+    error: Floats | None = None,
     *,
     max_iterations: int = 30,
     tolerance: float = 1e-6,
     on_pass: Callable[[], None] | None = None,
 ) -> Smoothed:
-    """The most probable path of a mission.
-
-    Memory is `memory_bytes`.
+    """The most probable path of a mission; it takes `memory_bytes`.
 
     Args:
         model: settings and camera.
         drive: how the camera moved.
         lives: the landmarks.
         first: states at the starts from which the search goes out [b, 3].
+        error: the inputs' errors from which it goes out [m, c]; default: none.
         max_iterations: of Gauss-Newton.
         tolerance: it ends where J falls by less.
         on_pass: called before each pass over the mission; what it raises ends the search.
@@ -195,69 +195,111 @@ def most_probable(
     Raises:
         ValueError: a landmark comes behind the camera on the way from `first`.
     """
-    (frames, n), m, c = lives.pixel.shape[:2], len(drive.dt), drive.columns.shape[1]
-    weight = np.linalg.inv(lives.covariance)
-    seen = (drive.dt, drive.omega, drive.velocity, drive.columns)
-    who = (drive.upto, lives.slot, lives.born, lives.last)
-
-    def cost_of(first: Floats, error: Floats) -> tuple[float, Floats, Floats, Floats]:
-        path, a, g = np.full((frames, n, 3), np.nan), np.zeros((m, n, 3, 3)), np.zeros((m, n, 3, c))
-        if _roll_out(model, drive.aligned, *seen, *who, first, error, path, a, g) >= 0:
-            return np.inf, path, a, g
-        off = first - lives.mean
-        misfit = np.nansum((lives.pixel - path[..., :2]) ** 2 / lives.variance[..., None])
-        drift = np.where(drive.q > 0.0, error**2 / np.where(drive.q > 0.0, drive.q, 1.0), 0.0).sum()
-        return float(np.einsum("bi,bij,bj", off, weight, off) + misfit + drift), path, a, g
-
-    def turn_over(covariance: Floats) -> tuple[Floats, Floats]:
-        if on_pass is not None:
-            on_pass()
-        shift, change = np.empty_like(first), np.empty((m, c))
-        _linear_smoother(
-            path, a, g, drive.q, error, lives.pixel, lives.variance, drive.upto, lives.slot, lives.born,
-            lives.mean, lives.covariance, shift, change, covariance,
-        )  # fmt: skip
-        return shift, change
-
-    first, error = first.copy(), np.zeros((m, c))
-    cost, path, a, g = cost_of(first, error)
+    first, error = first.copy(), np.zeros(drive.q.shape) if error is None else error.copy()
+    way = _way(model, drive, lives, first, error)
+    cost = _cost(drive, lives, first, error, way)
     if not np.isfinite(cost):
         raise ValueError(BEHIND)
     iterations, converged = 0, False
     while iterations < max_iterations and not converged:
         iterations += 1
-        shift, change = turn_over(np.empty((0, 0, 0)))
-        length, trial = 1.0, cost_of(first + shift, error + change)
-        while not trial[0] <= cost and length > SHORTEST_STEP:
+        if on_pass is not None:
+            on_pass()
+        shift, change = _step(drive, lives, error, way, _NOTHING)
+        length, reached = 2.0, np.inf
+        while not reached <= cost and length > SHORTEST_STEP:
             length *= 0.5
-            trial = cost_of(first + length * shift, error + length * change)
-        if not trial[0] <= cost:
-            converged = bool(np.isfinite(trial[0]))
+            trial = first + length * shift, error + length * change
+            ahead = _way(model, drive, lives, *trial)
+            reached = _cost(drive, lives, *trial, ahead)
+        if not reached <= cost:
+            converged = bool(np.isfinite(reached))
             break
-        converged = cost - trial[0] < tolerance
-        first, error = first + length * shift, error + length * change
-        cost, path, a, g = trial
-    covariance = np.zeros((frames, n, 9))
-    turn_over(covariance)
-    covariance[np.isnan(path[..., 2])] = np.nan
-    return Smoothed(path, covariance.reshape(frames, n, 3, 3), error, cost, iterations, converged)
+        converged = cost - reached < tolerance
+        (first, error), way, cost = trial, ahead, reached
+    covariance = np.zeros((*lives.pixel.shape[:2], 9))
+    if on_pass is not None:
+        on_pass()
+    _step(drive, lives, error, way, covariance)
+    covariance[np.isnan(way.path[..., 2])] = np.nan
+    return Smoothed(way.path, covariance.reshape(*way.path.shape, 3), error, cost, iterations, converged)
+
+
+def start_about(model: Model, drive: Drive, lives: Lives, about: Floats) -> tuple[Floats, Floats]:
+    """Where to search from: states at the starts [b, 3] and errors of the inputs [m, c], by one step from a path.
+
+    Args:
+        model: settings and camera.
+        drive: how the camera moved.
+        lives: the landmarks.
+        about: a path [F, N, 3] that the speeds need not lead along, such as a filter's; any value in empty slots.
+
+    Raises:
+        ValueError: a landmark comes behind the camera between two frames of that path.
+    """
+    first, error = about[lives.born, lives.slot], np.zeros(drive.q.shape)
+    way = _way(model, drive, lives, first, error, about)
+    if way.behind >= 0:
+        raise ValueError(BEHIND)
+    shift, change = _step(drive, lives, error, way, _NOTHING)
+    return first + shift, error + change
+
+
+def behind(model: Model, drive: Drive, lives: Lives, first: Floats, error: Floats) -> int:
+    """Which life comes first behind the camera on the way from `first` [b, 3] with errors [m, c]; -1: none."""
+    return _way(model, drive, lives, first, error).behind
 
 
 def memory_bytes(frames: int, intervals: int, slots: int, inputs: int) -> int:
     """The most that `most_probable` takes: P and the gains (3N)² F 8 (1 + 2/3), A and G of two paths, what it gives."""
-    return 8 * (15 * slots**2 * frames + 2 * (9 + 3 * inputs) * slots * intervals + 30 * slots * frames)
+    return 8 * (15 * slots**2 * frames + 2 * (9 + 3 * inputs) * slots * intervals + 35 * slots * frames)
 
 
-def behind(model: Model, drive: Drive, lives: Lives, first: Floats) -> int:
-    """Which life first comes behind the camera on the way from `first` [b, 3] by the measured speeds; -1: none."""
-    (frames, n), m, c = lives.pixel.shape[:2], len(drive.dt), drive.columns.shape[1]
-    return int(
-        _roll_out(
-            model, drive.aligned, drive.dt, drive.omega, drive.velocity, drive.columns, drive.upto,
-            lives.slot, lives.born, lives.last, first, np.zeros((m, c)),
-            np.empty((frames, n, 3)), np.empty((m, n, 3, 3)), np.empty((m, n, 3, c)),
-        )
+class _Way(NamedTuple):
+    """A path, with A and G, and the life that comes behind the camera (-1: none); `defect` where it jumps."""
+
+    path: Floats
+    a: Floats
+    g: Floats
+    defect: Floats
+    behind: int
+
+
+_NOTHING = np.empty((0, 0, 0))
+
+
+def _way(
+    model: Model, drive: Drive, lives: Lives, first: Floats, error: Floats, about: Floats = _NOTHING
+) -> _Way:
+    """The path from `first` with errors of the inputs, or that about a path."""
+    (frames, n), (m, c) = lives.pixel.shape[:2], drive.q.shape
+    path, a, g = np.full((frames, n, 3), np.nan), np.zeros((m, n, 3, 3)), np.zeros((m, n, 3, c))
+    defect = np.zeros(about.shape)
+    lost = _roll_out(
+        model, drive.aligned, drive.dt, drive.omega, drive.velocity, drive.columns, drive.upto,
+        lives.slot, lives.born, lives.last, first, error, about, path, a, g, defect,
     )  # fmt: skip
+    return _Way(path, a, g, defect, int(lost))
+
+
+def _cost(drive: Drive, lives: Lives, first: Floats, error: Floats, way: _Way) -> float:
+    """J; infinite where a landmark comes behind the camera."""
+    if way.behind >= 0:
+        return np.inf
+    off = first - lives.mean
+    misfit = np.nansum((lives.pixel - way.path[..., :2]) ** 2 / lives.variance[..., None])
+    drift = np.where(drive.q > 0.0, error**2 / np.where(drive.q > 0.0, drive.q, 1.0), 0.0).sum()
+    return float(np.einsum("bi,bij,bj", off, np.linalg.inv(lives.covariance), off) + misfit + drift)
+
+
+def _step(drive: Drive, lives: Lives, error: Floats, way: _Way, covariance: Floats) -> tuple[Floats, Floats]:
+    """The Gauss-Newton step of the states at the starts [b, 3] and of the inputs' errors [m, c]."""
+    shift, change = np.empty_like(lives.mean), np.empty(drive.q.shape)
+    _linear_smoother(
+        way.path, way.a, way.g, drive.q, error, lives.pixel, lives.variance, drive.upto, lives.slot, lives.born,
+        lives.mean, lives.covariance, way.defect, shift, change, covariance,
+    )  # fmt: skip
+    return shift, change
 
 
 @_jit
@@ -274,11 +316,17 @@ def _roll_out(
     last: Longs,
     first: Floats,
     error: Floats,
+    about: Floats,
     path: Floats,
     a: Floats,
     g: Floats,
+    defect: Floats,
 ) -> int:
-    """Fill `path` [F, N, 3], A and G, 0 in empty slots; gives which life comes behind the camera, -1 for none."""
+    """Fill `path` [F, N, 3], A and G, 0 in empty slots; gives which life comes behind the camera, -1 for none.
+
+    Where `about` [F, N, 3] has room, the path is that one, and `defect` [F, N, 3] is how far the flow from the frame
+    before ends from it.
+    """
     n = path.shape[1]
     state, life, begun = np.full((n, 3), np.nan), np.full(n, -1), 0
     turn, shift, six = np.empty(3), np.empty(3), np.empty((n, 3, 6))
@@ -306,6 +354,10 @@ def _roll_out(
                     g[k, i] = 0.0
                 elif not np.isfinite(state[i, 2]):
                     return life[i]
+        for i in range(n if len(about) else 0):
+            for r in range(3):
+                defect[f, i, r] = state[i, r] - about[f, i, r] if life[i] >= 0 else 0.0
+                state[i, r] = about[f, i, r] if life[i] >= 0 else np.nan
         while begun < len(born) and born[begun] == f:
             life[slot[begun]] = begun
             for r in range(3):
@@ -329,13 +381,14 @@ def _linear_smoother(
     born: Longs,
     prior: Floats,
     prior_covariance: Floats,
+    defect: Floats,
     shift: Floats,
     change: Floats,
     covariance: Floats,
 ) -> None:
     """The Gauss-Newton step about `path`: fills `shift` [b, 3] of the first states and `change` [m, c] of q.
 
-    Where `covariance` [F, N, 9] has room it is filled as well.
+    Where `covariance` [F, N, 9] has room it is filled as well; a path with jumps has a `defect` [F, N, 3].
     """
     frames, n, inputs = path.shape[0], path.shape[1], q.shape[1]
     d = 3 * n
@@ -356,6 +409,9 @@ def _linear_smoother(
                 for r in range(3):
                     mean[3 * i + r] = moved[r]
             blocks_ahead(p, a[k], g[k], q[k])
+        for i in range(n if len(defect) else 0):
+            for r in range(3):
+                mean[3 * i + r] += defect[f, i, r]
         while begun < len(born) and born[begun] == f:
             at = 3 * slot[begun]
             _empty(p, at)
