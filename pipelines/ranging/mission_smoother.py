@@ -10,7 +10,7 @@ from __future__ import annotations
 from array import array
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple
+from typing import ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -223,9 +223,7 @@ def _exact(settings: RangeSettings) -> Model:
     return settings.model_copy(update=forms).kernel_model
 
 
-def _group(
-    model: Model, drive: Drive, log: MissionLog, lives: list[Life], on_pass: Callable[[], None] | None
-) -> Group:
+def _group(model: Model, drive: Drive, log: MissionLog, lives: list[Life], on_pass: Callable[[], None] | None) -> Group:
     known, about = _known(log, lives)
     first, error = smoother.start_about(model, drive, known, about)
     failed, left_out = np.zeros(len(lives), np.int64), list[Life]()

@@ -268,9 +268,7 @@ class _Way(NamedTuple):
 _NOTHING = np.empty((0, 0, 0))
 
 
-def _way(
-    model: Model, drive: Drive, lives: Lives, first: Floats, error: Floats, about: Floats = _NOTHING
-) -> _Way:
+def _way(model: Model, drive: Drive, lives: Lives, first: Floats, error: Floats, about: Floats = _NOTHING) -> _Way:
     """The path from `first` with errors of the inputs, or that about a path."""
     (frames, n), (m, c) = lives.pixel.shape[:2], drive.q.shape
     path, a, g = np.full((frames, n, 3), np.nan), np.zeros((m, n, 3, 3)), np.zeros((m, n, 3, c))
@@ -353,7 +351,7 @@ def _roll_out(
                     a[k, i] = 0.0
                     g[k, i] = 0.0
                 elif not np.isfinite(state[i, 2]):
-                    return life[i]
+                    return int(life[i])
         for i in range(n if len(about) else 0):
             for r in range(3):
                 defect[f, i, r] = state[i, r] - about[f, i, r] if life[i] >= 0 else 0.0
