@@ -224,6 +224,8 @@ def _exact(settings: RangeSettings) -> Model:
 
 
 def _group(model: Model, drive: Drive, log: MissionLog, lives: list[Life], on_pass: Callable[[], None] | None) -> Group:
+    if on_pass is not None:
+        on_pass()
     known, about = _known(log, lives)
     first, error = smoother.start_about(model, drive, known, about)
     failed, left_out = np.zeros(len(lives), np.int64), list[Life]()
