@@ -31,6 +31,8 @@ Longs = NDArray[np.int64]
 
 MEMORY_BYTES = 2**30
 """What smoothing may take; landmarks are smoothed in groups of as many slots as this allows, up to `JOINT_LIMIT`."""
+MAX_ITERATIONS, TOLERANCE = 60, 1e-5
+"""Of the search, see `smoother.most_probable`; logs whose noise is not what the settings say take many."""
 HALVINGS = 12
 """So often is the ξ halved that a search starts from, until the landmark stays before the camera."""
 
@@ -237,7 +239,9 @@ def _group(model: Model, drive: Drive, log: MissionLog, lives: list[Life], on_pa
             first, failed, known = np.delete(first, at, 0), np.delete(failed, at), _known(log, lives)[0]
     if not lives:
         return Group([], left_out, 0, True)
-    found = smoother.most_probable(model, drive, known, first, error, on_pass=on_pass)
+    found = smoother.most_probable(
+        model, drive, known, first, error, max_iterations=MAX_ITERATIONS, tolerance=TOLERANCE, on_pass=on_pass
+    )
     told = []
     for life, column in zip(lives, known.slot.tolist(), strict=True):
         frames = np.s_[life.born : life.at[-1] + 1, column]
