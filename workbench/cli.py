@@ -286,6 +286,9 @@ def replay(
             help="Tell the scale and mounting yaw that fit; with -e range: gyro bias, focus, delay.",
         ),
     ] = False,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="With -e range: the best ranges after the mission, from all of it.")
+    ] = False,
     raw_images: Annotated[str, typer.Option(metavar="FORM", help="Keep raw images as png or raw.")] = "png",
     rate: Rate = None,
     times: TimesFile = None,
@@ -322,6 +325,7 @@ def replay(
         height=height,
         options=_options(rate, times, times_unit, tf),
         calibrate=calibrate,
+        smooth=smooth,
         raw_images=_one_of(raw_images, ("png", "raw"), "--raw-images"),
     )
     _conclude(_replay(request), as_json)

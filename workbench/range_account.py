@@ -25,6 +25,7 @@ from pipelines.ranging.step import RangeStep
 from readers.streams import Camera, Landmark, StreamKind
 from workbench.inputs import Reference
 from workbench.range_calibration import SensorCalibration
+from workbench.range_smoothing import COVERED_SIGMAS, Smoothing, error_values
 from workbench.range_traces import GATE, Beside, RangeScene
 from workbench.settings import Resolved
 from workbench.summary import Tally, range_suitability
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-COVERED_SIGMAS = 2.0
 BAND = 0.95
 """Share of right filters whose mean NIS lies within the band."""
 MAX_GAP_S = 1.0
@@ -81,6 +81,7 @@ class RangeAccount:
         offset_ns: added to the frames' times to find the reference.
         degrees: of freedom of an image point.
         sensors: collects what tells of the sensors; None where nobody asked.
+        smoothing: smooths the run at its end; None where nobody asked.
     """
 
     trajectory = False
@@ -95,11 +96,12 @@ class RangeAccount:
         offset_ns: int = 0,
         degrees: int = 2,
         sensors: SensorCalibration | None = None,
+        smoothing: Smoothing | None = None,
     ) -> None:
         self.scene = scene
         self._ranges, self._poses, self._body_t_camera = ranges, poses, body_t_camera
         self._sentence, self._offset_ns, self._degrees = sentence, offset_ns, degrees
-        self._sensors = sensors
+        self._sensors, self.smoothing = sensors, smoothing
         self._lives: dict[int, Life] = {}
         self._carried = self._measured = self._converged = 0
 
@@ -113,6 +115,7 @@ class RangeAccount:
         offset_ns: int,
         *,
         calibrate: bool = False,
+        smooth: bool = False,
     ) -> RangeAccount:
         """The account of a replay with these settings and this reference."""
         settings: Any = resolved.settings
@@ -145,7 +148,8 @@ class RangeAccount:
             scene = dataclasses.replace(scene, on_image=lambda points: _seen(own, points))
         sentence = _sentence(reference, landmarks, bearings, board is not None)
         sensors = SensorCalibration(settings, bool(streams.imu)) if calibrate else None
-        return cls(scene, ranges, poses, body_t_camera, sentence, offset_ns, 1 if bearings else 2, sensors)
+        smoothing = Smoothing(settings) if smooth else None
+        return cls(scene, ranges, poses, body_t_camera, sentence, offset_ns, 1 if bearings else 2, sensors, smoothing)
 
     # ---- step by step
 
@@ -158,6 +162,8 @@ class RangeAccount:
         ids = np.nan_to_num(step.landmark_id, nan=-1).astype(np.int64)
         depth = self._ranges.at(step.t_ns + self._offset_ns, ids).depth_m
         depth = np.where(depth > 0, depth, np.nan)
+        if self.smoothing is not None:
+            self.smoothing.take(depth)
         self._carried += step.landmarks
         self._measured += step.measured
         self._converged += step.converged
@@ -216,6 +222,7 @@ class RangeAccount:
             "reference": self._sentence if ranging["error"] else self._without(),
             "ranging": ranging,
             "evaluation": None,
+            "smoothed": None if self.smoothing is None else self.smoothing.told(),
             "calibration": None if self._sensors is None else self._sensors.told(),
             "suitability": range_suitability(tally, ranging),
         }, None
@@ -248,17 +255,7 @@ class RangeAccount:
 def _errors(lives: list[Life]) -> dict[str, float] | None:
     """Relative errors of the ranges that counted, in percent, and their consistency; None where none is known."""
     errors = np.concatenate([np.zeros(0), *(np.frombuffer(life.errors) for life in lives)])
-    count = len(errors)
-    if not count:
-        return None
-    return {
-        "count": count,
-        "median_percent": 100 * float(np.median(np.abs(errors))),
-        "rms_percent": 100 * float(np.sqrt(np.mean(errors**2))),
-        "bias_percent": 100 * float(np.median(errors)),
-        "nees": sum(life.nees for life in lives) / count,
-        "coverage": sum(life.covered for life in lives) / count,
-    }
+    return error_values(errors, sum(life.nees for life in lives), sum(life.covered for life in lives))
 
 
 def _placed(camera: Camera | None, body_t_camera: Floats) -> Camera:

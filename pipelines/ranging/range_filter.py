@@ -130,7 +130,7 @@ class Candidate(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RangeState:
-    """All that the estimator carries from sample to sample."""
+    """All that the estimator carries from sample to sample; `ride` is the way to the last frame, for who looks on."""
 
     source: Any
     velocities: Velocities
@@ -140,6 +140,7 @@ class RangeState:
     history: History
     pose: Pose
     sighting: Sighting = NOTHING
+    ride: Ride | None = None
     candidates: tuple[Candidate, ...] = ()
     frames: int = 0
     last_ns: int = -1
@@ -293,6 +294,7 @@ class RangeFilter:
             history=history,
             pose=driven.pose,
             sighting=sighting,
+            ride=ride,
             candidates=self._waiting(state, driven, used, started, everyone, sample.t_ns) if moving else (),
             frames=state.frames + 1,
             last_ns=sample.t_ns,

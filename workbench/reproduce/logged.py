@@ -42,6 +42,7 @@ class _Noted:
     def __init__(self, log: session.RunLog, take: Callable[[Step], None]) -> None:
         self._log, self._take = log, take
         self.event, self.errors, self.finish, self.close = log.event, log.errors, log.finish, log.close
+        self.smoothed = log.smoothed
 
     def step(self, step: Step, beside: Any = None) -> None:
         """Note and log a step."""
