@@ -152,7 +152,7 @@ class RangeAccount:
     def take(self, step: Step, sample: Frame) -> Beside:
         """Follow the landmarks of one step; what the reference says of its frame."""
         assert isinstance(step, RangeStep)
-        self._ranges.take(sample)
+        self._ranges.take(dataclasses.replace(sample, t_ns=step.t_ns))  # as the estimator dates it
         if self._sensors is not None:
             self._sensors.take(step)
         ids = np.nan_to_num(step.landmark_id, nan=-1).astype(np.int64)

@@ -69,7 +69,7 @@ class Velocities:
         gyro: angular velocity by the IMU [3], rad/s, its bias in it.
         window: velocities of the last `standstill_s`.
         rest: the rest at the start.
-        disorder: a message came late since the last frame.
+        disorder: since the last frame a message came late: after a later one of its kind, or after its frame.
         unusable: a message could not be used since the last frame.
     """
 
@@ -166,6 +166,7 @@ def with_odometry(s: RangeSettings, known: Velocities, sample: OdometrySample, l
     late = bool(known.speed.t_ns) and sample.t_ns < known.speed.t_ns[-1]
     if late and sample.t_ns <= last_frame_ns:
         return replace(known, disorder=True)
+    disorder = late or sample.t_ns < last_frame_ns
     window = known.window if late else _windowed(s, known.window.having(sample.t_ns, used))
     still = float(s.zero_velocity_update and stands(s, window))
     wheels = known.wheels
@@ -182,7 +183,7 @@ def with_odometry(s: RangeSettings, known: Velocities, sample: OdometrySample, l
         wheels=wheels,
         window=window,
         rest=rest,
-        disorder=known.disorder or late,
+        disorder=known.disorder or disorder,
     )
 
 
@@ -195,7 +196,7 @@ def with_imu(s: RangeSettings, known: Velocities, sample: ImuSample, last_frame_
     if late and sample.t_ns <= last_frame_ns:
         return replace(known, disorder=True)
     gyro = _kept(known.gyro.having(sample.t_ns, tuple(omega.tolist())), last_frame_ns)
-    return replace(known, gyro=gyro, disorder=known.disorder or late)
+    return replace(known, gyro=gyro, disorder=known.disorder or late or sample.t_ns < last_frame_ns)
 
 
 def _kept(signal: Signal, last_frame_ns: int) -> Signal:
