@@ -117,6 +117,8 @@ class RangeAccount:
         """The account of a replay with these settings and this reference."""
         settings: Any = resolved.settings
         bearings = streams.kind is StreamKind.LANDMARKS
+        found_in_images = streams.kind is StreamKind.IMAGE
+        known = {} if found_in_images else landmarks  # what is found in images has numbers of its own
         body_t_camera = np.eye(4)
         body_t_camera[:3, :3] = settings.body_r_camera
         body_t_camera[:3, 3] = settings.camera_position_m or (0.0, 0.0, 0.0)
@@ -125,7 +127,7 @@ class RangeAccount:
         board = _board_of(resolved)
         ranges = ReferenceRanges(
             _placed(own, body_t_camera),
-            landmarks=landmarks,
+            landmarks=known,
             pose_stream=reference.stream or "none",
             board=board,
             max_gap_s=MAX_GAP_S,
@@ -143,7 +145,7 @@ class RangeAccount:
         )
         if own is not None and not undistorted(own):
             scene = dataclasses.replace(scene, on_image=lambda points: _seen(own, points))
-        sentence = _sentence(reference, landmarks, bearings, board is not None)
+        sentence = _sentence(reference, known, bearings, board is not None, found_in_images)
         sensors = SensorCalibration(settings, bool(streams.imu)) if calibrate else None
         return cls(scene, ranges, poses, body_t_camera, sentence, offset_ns, 1 if bearings else 2, sensors)
 
@@ -298,14 +300,16 @@ def _seen(camera: Camera, points_px: Floats) -> Floats:
 def _board_of(resolved: Resolved) -> BoardSettings | MarkerSettings | None:
     """The board whose pose tells ranges: where its size was given."""
     settings: Any = resolved.settings
-    if settings.landmarks is LandmarkKind.CHESSBOARD and "board" in resolved.given:
+    if settings.landmarks is LandmarkKind.CHESSBOARD and settings.board.square_m is not None:
         return cast(BoardSettings, settings.board)
     if settings.landmarks is LandmarkKind.ARUCO and "markers" in resolved.given:
         return cast(MarkerSettings, settings.markers)
     return None
 
 
-def _sentence(reference: Reference, landmarks: Mapping[int, Landmark], bearings: bool, board: bool) -> str:
+def _sentence(
+    reference: Reference, landmarks: Mapping[int, Landmark], bearings: bool, board: bool, found_in_images: bool
+) -> str:
     """What the reference ranges come from."""
     parts = []
     if landmarks and reference.poses:
@@ -316,6 +320,8 @@ def _sentence(reference: Reference, landmarks: Mapping[int, Landmark], bearings:
         parts.append("the pose of the board, whose size was given")
     if parts:
         return ", else ".join(parts)
+    if found_in_images:
+        return "none: the landmarks are found in the images, and nothing tells where they are (a board's size would)"
     if landmarks:
         return f"none: {len(landmarks)} surveyed landmarks, but {reference.sentence}"
     return f"none: no surveyed landmarks; reference poses: {reference.sentence}"
