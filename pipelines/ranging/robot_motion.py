@@ -223,15 +223,13 @@ def stands(s: RangeSettings, window: Signal) -> bool:
     """
     if not _lasts(s, window):
         return False
-    limit = (s.standstill_sigmas * s.sigma_speed) ** 2 * NS
-    t_ns, x, y, z = window.t_ns, 0.0, 0.0, 0.0
-    for k in range(len(t_ns) - 1, 0, -1):
-        dt = (t_ns[k] - t_ns[k - 1]) * NS
-        vx, vy, vz = window.values[k]
-        x, y, z = x + vx * dt, y + vy * dt, z + vz * dt
-        if x * x + y * y + z * z > limit * (t_ns[-1] - t_ns[k - 1]):
-            return False
-    return math.hypot(x, y, z) <= s.standstill_limit_mps * (t_ns[-1] - t_ns[0]) * NS
+    t_ns = np.array(window.t_ns)
+    back = np.diff(t_ns)[::-1, None] * NS * np.array(window.values[:0:-1])
+    way_m = np.linalg.norm(np.cumsum(back, axis=0), axis=1)
+    noise_m = s.standstill_sigmas * s.sigma_speed * np.sqrt((t_ns[-1] - t_ns[-2::-1]) * NS)
+    if (way_m > noise_m).any():
+        return False
+    return bool(way_m[-1] <= s.standstill_limit_mps * (t_ns[-1] - t_ns[0]) * NS)
 
 
 # ----------------------------------------------------------------------------- a frame
