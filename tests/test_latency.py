@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Iterator, Sequence
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -17,8 +18,10 @@ from pipelines.latency import LatencyBuffer
 from pipelines.ranging.range_filter import RangeFilter
 from pipelines.replay import Replayed, replay
 from pipelines.verdict import Verdict
+from readers import open_recording
 from readers.streams import RecordingError, Sample, StreamKind
 from tests.toys import ToyRecording
+from workbench.cli import main
 from workbench.range_inputs import Streams, latency_of
 
 INPUTS = ("imu", "odometry")
@@ -207,3 +210,15 @@ def test_the_replay_takes_messages_as_they_arrived_and_sorts_them() -> None:
     assert [r.step.range_m[0] for r in plain] == [r.step.range_m[0] for r in buffered]  # type: ignore[attr-defined]
     unsorted = ranges(LatencyBuffer(wait_ns=0, frames=["tracks"]))
     assert any(Verdict.INPUT_OUT_OF_ORDER in r.step.alarms for r in unsorted)
+
+
+def test_a_log_gives_its_messages_as_they_were_logged(tmp_path: Path) -> None:
+    brief = ("duration_s=0.6", "camera.width_px=64", "camera.height_px=48", "front.width_px=64", "front.height_px=48")
+    file = tmp_path / "late.mcap"
+    assert main(["simulate", "sensors", "-o", str(file), *(word for one in brief for word in ("--set", one))]) == 0
+    names = ["/imu", "/wheel/odometry", "/front/tracks"]
+    with open_recording(file) as log:
+        arrived, by_stamp = list(log.arrivals(names)), list(log.read(names))
+    assert {s.stream for s in arrived} == set(names)
+    assert [s.received_ns for s in arrived] == sorted(s.received_ns for s in by_stamp)
+    assert sorted(s.t_ns for s in arrived) == [s.t_ns for s in by_stamp] != [s.t_ns for s in arrived]
