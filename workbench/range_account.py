@@ -120,6 +120,8 @@ class RangeAccount:
         """The account of a replay with these settings and this reference."""
         settings: Any = resolved.settings
         bearings = streams.kind is StreamKind.LANDMARKS
+        found_in_images = streams.kind is StreamKind.IMAGE
+        known = {} if found_in_images else landmarks  # what is found in images has numbers of its own
         body_t_camera = np.eye(4)
         body_t_camera[:3, :3] = settings.body_r_camera
         body_t_camera[:3, 3] = settings.camera_position_m or (0.0, 0.0, 0.0)
@@ -128,7 +130,7 @@ class RangeAccount:
         board = _board_of(resolved)
         ranges = ReferenceRanges(
             _placed(own, body_t_camera),
-            landmarks=landmarks,
+            landmarks=known,
             pose_stream=reference.stream or "none",
             board=board,
             max_gap_s=MAX_GAP_S,
@@ -146,7 +148,7 @@ class RangeAccount:
         )
         if own is not None and not undistorted(own):
             scene = dataclasses.replace(scene, on_image=lambda points: _seen(own, points))
-        sentence = _sentence(reference, landmarks, bearings, board is not None)
+        sentence = _sentence(reference, known, bearings, board is not None, found_in_images)
         sensors = SensorCalibration(settings, bool(streams.imu)) if calibrate else None
         smoothing = Smoothing(settings) if smooth else None
         return cls(scene, ranges, poses, body_t_camera, sentence, offset_ns, 1 if bearings else 2, sensors, smoothing)
@@ -156,7 +158,7 @@ class RangeAccount:
     def take(self, step: Step, sample: Frame) -> Beside:
         """Follow the landmarks of one step; what the reference says of its frame."""
         assert isinstance(step, RangeStep)
-        self._ranges.take(sample)
+        self._ranges.take(dataclasses.replace(sample, t_ns=step.t_ns))  # as the estimator dates it
         if self._sensors is not None:
             self._sensors.take(step)
         ids = np.nan_to_num(step.landmark_id, nan=-1).astype(np.int64)
@@ -294,14 +296,16 @@ def _seen(camera: Camera, points_px: Floats) -> Floats:
 def _board_of(resolved: Resolved) -> BoardSettings | MarkerSettings | None:
     """The board whose pose tells ranges: where its size was given."""
     settings: Any = resolved.settings
-    if settings.landmarks is LandmarkKind.CHESSBOARD and "board" in resolved.given:
+    if settings.landmarks is LandmarkKind.CHESSBOARD and settings.board.square_m is not None:
         return cast(BoardSettings, settings.board)
     if settings.landmarks is LandmarkKind.ARUCO and "markers" in resolved.given:
         return cast(MarkerSettings, settings.markers)
     return None
 
 
-def _sentence(reference: Reference, landmarks: Mapping[int, Landmark], bearings: bool, board: bool) -> str:
+def _sentence(
+    reference: Reference, landmarks: Mapping[int, Landmark], bearings: bool, board: bool, found_in_images: bool
+) -> str:
     """What the reference ranges come from."""
     parts = []
     if landmarks and reference.poses:
@@ -312,6 +316,8 @@ def _sentence(reference: Reference, landmarks: Mapping[int, Landmark], bearings:
         parts.append("the pose of the board, whose size was given")
     if parts:
         return ", else ".join(parts)
+    if found_in_images:
+        return "none: the landmarks are found in the images, and nothing tells where they are (a board's size would)"
     if landmarks:
         return f"none: {len(landmarks)} surveyed landmarks, but {reference.sentence}"
     return f"none: no surveyed landmarks; reference poses: {reference.sentence}"

@@ -29,6 +29,7 @@ import numpy as np
 from pipelines.estimator import Estimator, Step
 from pipelines.evaluation import Evaluation, EvaluationError, Trajectory, evaluate, mean_angle, path_lengths
 from pipelines.geometry import Floats, wrap_angle
+from pipelines.latency import LatencyBuffer
 from pipelines.replay import Frame, Replayed, replay
 from pipelines.verdict import Severity
 from readers.clock import StreamAudit
@@ -304,6 +305,7 @@ class _Chosen:
     account: Account
     ground: Floats | None
     scene: Any = None
+    latency: LatencyBuffer | None = None
     notes: Sequence[str] = ()
     smoothing: Smoothing | None = None
 
@@ -369,6 +371,7 @@ def _choose_for_ranges(request: Request, recording: Recording, resolved: Resolve
         ground=None,
         scene=account.scene,
         smoothing=account.smoothing,
+        latency=range_inputs.latency_of(resolved.settings, streams),
         notes=[*streams.notes, *notes],
     )
 
@@ -405,7 +408,13 @@ class _Audited(Recording):
     def read(
         self, streams: Sequence[str] | None = None, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Sample]:
-        for sample in self._inner.read(streams, start_ns, stop_ns):
+        return self._audited(self._inner.read(streams, start_ns, stop_ns))
+
+    def arrivals(self, streams: Sequence[str] | None = None) -> Iterator[Sample]:
+        return self._audited(self._inner.arrivals(streams))
+
+    def _audited(self, samples: Iterator[Sample]) -> Iterator[Sample]:
+        for sample in samples:
             if sample.stream not in self.audits:
                 self.audits[sample.stream] = StreamAudit(sample.stream)
             self.audits[sample.stream].add(sample)
@@ -613,6 +622,7 @@ class _Session:
             start_ns=self.chosen.start_ns,
             stop_ns=self.chosen.stop_ns,
             stride=self.request.stride,
+            latency=self.chosen.latency,
             on_progress=tell,
         )
 
@@ -651,6 +661,8 @@ class _Session:
     ) -> dict[str, Any]:
         """Judge the run, log what is known at its end, and return the summary."""
         facts, damage = self.recording.facts(), self.recording.damage_lines()
+        if self.chosen.latency is not None:
+            facts += self.chosen.latency.facts()
         found, aligned = self.chosen.account.conclude(run, tally, span.median_dt_s)
         summary = self._summary(tally, span, found, interrupted, stopped) | {"facts": facts, "damage": damage}
         if tally.frames:

@@ -166,7 +166,8 @@ class RangeFilter:
     """Estimates the ranges of landmarks from a moving camera (paper B), each with its uncertainty.
 
     Samples: frames of one stream (images, pixel tracks or bearings, whichever the landmarks come from), odometry, and
-    the IMU's angular velocity where there is one. A frame is judged with the messages that came before it.
+    the IMU's angular velocity where there is one. A frame is judged with the messages that came before it. Its step is
+    of the time at which it was taken: its stamp less `camera_delay_s`.
 
     Args:
         settings: every setting; see `RangeSettings`.
@@ -189,6 +190,7 @@ class RangeFilter:
         self._centre = settings.pinhole_centre_px
         self._noise = noise_of(settings)
         self._body_r_camera = settings.body_r_camera
+        self._delay_ns = round(settings.camera_delay_s / NS)
 
     @property
     def settings(self) -> RangeSettings:
@@ -218,6 +220,7 @@ class RangeFilter:
             unusable = sample.kind in (StreamKind.ODOMETRY, StreamKind.IMU)
             velocities = replace(state.velocities, unusable=state.velocities.unusable or unusable)
             return replace(state, velocities=velocities), None
+        sample = replace(sample, t_ns=sample.t_ns - self._delay_ns)
         if state.frames and sample.stream == state.stream and sample.t_ns <= state.last_ns:
             return self._skip(state, sample)
         source, sighting = self._sighted(state, sample)
