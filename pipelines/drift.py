@@ -248,8 +248,9 @@ def _shares(path: Floats, truth: Floats, error: Floats, aligned_error: Floats) -
     """
     q = truth[:, :2]
     x, y = aligned_error.T
-    after = np.column_stack([x, y, x * q[:, 0] + y * q[:, 1], y * q[:, 0] - x * q[:, 1]])  # Σ ẽ, Σ ẽ · q, Σ ẽ · J q
-    x, y, dot, cross = np.cumsum(after[::-1], axis=0)[::-1][1:].T
+    # per pose ẽ, ẽ · q and ẽ · J q, J a quarter turn; then summed over all poses from each one on
+    terms = np.column_stack([x, y, x * q[:, 0] + y * q[:, 1], y * q[:, 0] - x * q[:, 1]])
+    x, y, dot, cross = np.cumsum(terms[::-1], axis=0)[::-1][1:].T
     a = rotated(error[:, :2], path[:-1, 2])
     here = q[1:]
     dot = dot - (x * here[:, 0] + y * here[:, 1])

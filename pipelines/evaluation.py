@@ -7,7 +7,7 @@ Association interpolates the reference at the estimate's times. The absolute err
 least-squares alignment in the plane (S. Umeyama, IEEE PAMI 13(4), 1991, reduced to two dimensions, where the
 rotation has a closed form). The relative error (RPE) compares motions over a distance or a time, as
 J. Sturm et al. (IROS 2012) define it. The drift is the error of the last pose after the first poses were laid
-over one another, as a share of the reference's path.
+over one another, as a share of the reference's path. NEES weighs errors by the estimate's own covariances.
 """
 
 from __future__ import annotations
@@ -21,7 +21,8 @@ from typing import Literal, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry import heading_of_quat, wrap_angle, wrap_angles
+from pipelines.consistency import nees_of
+from pipelines.geometry import heading_of_quat, rotated, wrap_angle, wrap_angles
 from readers.streams import PoseSample, WorkbenchError
 
 Floats = NDArray[np.float64]
@@ -342,6 +343,41 @@ def end_point_error(estimate: Floats, reference: Floats, whole: Alignment) -> fl
     """Distance in metres between the last positions after `align_start`."""
     last = align_start(estimate, reference, whole)(estimate[-1:])[0]
     return math.hypot(last[0] - reference[-1, 0], last[1] - reference[-1, 1])
+
+
+def pose_nees(
+    estimate: Trajectory,
+    covariance: Floats,
+    reference: Trajectory,
+    *,
+    offset_ns: int = 0,
+    method: Method = "interpolate",
+    max_gap_ns: int | None = None,
+) -> tuple[NDArray[np.int64], Floats]:
+    """NEES of poses in the plane: which poses [m] have a reference, and eᵀ P⁻¹ e of them [m].
+
+    Errors are those after `align_start`, turned back into the axes of the estimate's world, in which `covariance`
+    [n, 3, 3] of x, y, heading (m², m·rad, rad²) since the start is given. NaN where it is not known, or not positive
+    definite, as at the start itself. Of a right estimator each is χ² with 3 degrees of freedom
+    (`pipelines.consistency.Consistency`), but those along one path are not independent of one another.
+
+    Raises:
+        EvaluationError: fewer than 2 poses, or fewer than half of them, have a reference.
+        ValueError: there is not one covariance for each pose.
+    """
+    if covariance.shape != (len(estimate), 3, 3):
+        raise ValueError(f"covariances of shape {covariance.shape} for {len(estimate)} poses: [n, 3, 3] is needed")
+    index, truth = associated(estimate, reference, offset_ns=offset_ns, method=method, max_gap_ns=max_gap_ns)
+    raw = estimate.pose[index]
+    start = align_start(raw, truth, align(raw, truth))
+    x, y, _, heading = _errors(start(raw), truth).T
+    back = np.full(len(index), -start.rotation_rad)
+    error = np.column_stack([rotated(np.column_stack([x, y]), back), heading])
+    nees = np.full(len(index), np.nan)
+    known = np.isfinite(covariance[index]).all(axis=(1, 2)) & np.isfinite(error).all(axis=1)
+    known[known] = np.linalg.eigvalsh(covariance[index][known])[:, 0] > 0
+    nees[known] = nees_of(error[known], covariance[index][known])
+    return index, nees
 
 
 def relative_error(estimate: Floats, reference: Floats, along: Floats, delta: float, unit: str) -> Relative:

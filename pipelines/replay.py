@@ -23,6 +23,7 @@ from typing import Any
 import numpy as np
 
 from pipelines.estimator import Estimator, Step
+from pipelines.latency import LatencyBuffer
 from readers.streams import (
     ImageError,
     ImageSample,
@@ -64,6 +65,7 @@ def replay(
     start_ns: int | None = None,
     stop_ns: int | None = None,
     stride: int = 1,
+    latency: LatencyBuffer | None = None,
     decode_ahead: int = 4,
     on_progress: OnProgress | None = None,
 ) -> Generator[Replayed]:
@@ -83,6 +85,7 @@ def replay(
         start_ns: first sensor time of the window (included), None for the start of the recording.
         stop_ns: last sensor time of the window (excluded), None for its end.
         stride: use every n-th frame of the window; the others are not decoded.
+        latency: a buffer that sorts the samples by time; None: they come as the reader sorts them.
         decode_ahead: how many images are decoded ahead of the estimator.
         on_progress: called after each step with the number of steps so far and the frame's time in ns.
 
@@ -98,9 +101,26 @@ def replay(
     for name in names:
         recording.stream(name)
     first = 0 if start_ns is None else recording.count_before(image_stream, start_ns)
-    chosen = _numbered(recording.read(names, start_ns, stop_ns), image_stream, first, stride)
+    if latency is None:
+        samples = recording.read(names, start_ns, stop_ns)
+    else:
+        samples = latency.through(_unsorted(recording, names, start_ns, stop_ns, latency.by_arrival), other_streams)
+    chosen = _numbered(samples, image_stream, first, stride)
     steps = _steps(_decoded_ahead(chosen, decode_ahead, shown), estimator, image_stream, shown)
     return _told(_with_shown(steps) if shown else steps, on_progress)
+
+
+def _unsorted(
+    recording: Recording, names: Sequence[str], start_ns: int | None, stop_ns: int | None, by_arrival: bool
+) -> Iterator[Sample]:
+    """The samples of a window, as they were received or as the reader sorts them."""
+    if not by_arrival:
+        return recording.read(names, start_ns, stop_ns)
+    return (
+        sample
+        for sample in recording.arrivals(names)
+        if (start_ns is None or start_ns <= sample.t_ns) and (stop_ns is None or sample.t_ns < stop_ns)
+    )
 
 
 def _steps(

@@ -246,7 +246,13 @@ def _motions(path: SpatialPath, pairs: Pairs) -> tuple[Floats, Rotation]:
 
 
 def pairs_by_frames(count: int, delta: int, *, every: bool = True) -> Pairs:
-    """Pairs `delta` rows apart, of `count` rows: from every row on, or one after the other."""
+    """Pairs `delta` rows apart, of `count` rows: from every row on, or one after the other.
+
+    Raises:
+        ValueError: `delta` is below 1.
+    """
+    if delta < 1:
+        raise ValueError(f"delta must be 1 frame or more, not {delta}")
     first = np.arange(0, max(count - delta, 0), 1 if every else delta)
     return np.column_stack([first, first + delta])
 
@@ -257,7 +263,12 @@ def pairs_by_measure(along: Floats, delta: float, *, tolerance: float = 0.1, eve
     From every row on (``every``), the row whose distance is nearest to `delta`, if it is within `tolerance` · delta.
     Else one after the other: each pair begins where the one before ended, and ends at the first row where at least
     `delta` has passed. These are evo's pairs of metres.
+
+    Raises:
+        ValueError: `delta` is not positive.
     """
+    if not delta > 0:
+        raise ValueError(f"delta must be positive, not {delta}")
     if every:
         return _nearest_pairs(along, delta, tolerance)
     ends, last = [0], 0.0
@@ -270,6 +281,8 @@ def pairs_by_measure(along: Floats, delta: float, *, tolerance: float = 0.1, eve
 
 def _nearest_pairs(along: Floats, delta: float, tolerance: float) -> Pairs:
     n = len(along)
+    if n < 2:
+        return np.empty((0, 2), dtype=np.int64)
     first = np.arange(n - 1)
     after = np.searchsorted(along, along[:-1] + delta).clip(first + 1, n - 1)
     before = np.maximum(after - 1, first + 1)

@@ -1,8 +1,8 @@
 """The offset between two trajectories' clocks, from their speeds: a pipeline's answer to unsynchronised logs.
 
 Speeds do not depend on the frame in which a path is given, nor on where it starts, so that they can be compared before
-any alignment. Both are taken over the same stretch of time, T = 2 `half_window_s`, on one raster: s(t) = |p(t + T/2) -
-p(t - T/2)|/T. The lag with the highest normalised correlation is found over the raster, and refined by Gauss-Newton
+any alignment. Both are taken over the same stretch of time, T = 2 `half_window_s`: s(t) = |p(t + T/2) -
+p(t - T/2)|/T. The lag with the highest normalised correlation is found over a raster, and refined by Gauss-Newton
 on Σ (s_ref(t + τ) - k s_est(t) - b)² in the lag τ, the scale k and the offset b of the speeds. Its standard deviation
 is that of the sum Σ slope · residual, the correlation of its terms over time included (a sandwich estimate).
 """
@@ -23,8 +23,8 @@ LEAST_CORRELATION = 0.5
 """Below this the speeds are not those of one motion."""
 HALF_WINDOW_S = 0.5
 """Half the time over which speeds are taken: longer than the noise of positions, shorter than changes of speed."""
-RASTER = 2
-"""Samples of the raster per median step of the faster path."""
+COARSE = 4
+"""Lags that are looked at per half window, before the best one is refined."""
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -71,22 +71,21 @@ def time_offset(
         return _unknown("one of the paths has fewer than 3 poses")
     steps = [float(np.median(np.diff(path.t_ns))) / SECOND_NS for path in (estimate, reference)]
     half = max(HALF_WINDOW_S, 2 * max(steps)) if half_window_s is None else half_window_s
-    raster = min(steps) / RASTER
     origin = int(estimate.t_ns[0])
     moved, truth = _Speed(estimate, origin, half), _Speed(reference, origin, half)
+    raster = half / COARSE
     t = np.arange(moved.first, moved.last, raster)
-    if len(t) < 10:
-        return _unknown("the estimate is too short for its speeds")
-    lags = around_s + np.arange(-math.ceil(max_offset_s / raster), math.ceil(max_offset_s / raster) + 1) * raster
+    reach = math.ceil(max_offset_s / raster)
+    lags = around_s + np.arange(-reach, reach + 1) * raster
     found = _correlations(moved.at(t), truth, t, lags, raster)
     if not np.isfinite(found).any():
-        return _unknown("the two paths have no time in common within the offsets that are looked at")
+        return _unknown("the two paths have too little time in common within the offsets that are looked at")
     best = int(np.nanargmax(found))
     if found[best] < LEAST_CORRELATION:
         return _unknown(f"the speeds do not go together: their correlation is {found[best]:.2f} at best")
     if best in (0, len(lags) - 1):
         return _unknown("the best offset lies at the border of those that are looked at")
-    return _refined(moved, truth, t, float(lags[best]), raster)
+    return _refined(moved, truth, np.arange(moved.first, moved.last, min(steps)), float(lags[best]))
 
 
 class _Speed:
@@ -128,14 +127,14 @@ def _correlations(
     return result
 
 
-def _refined(moved: _Speed, truth: _Speed, t: Floats, coarse: float, raster: float) -> TimeOffset:
+def _refined(moved: _Speed, truth: _Speed, t: Floats, coarse: float) -> TimeOffset:
     """Gauss-Newton on the lag; scale and offset of the speeds are fitted anew for every lag."""
     lag = coarse
     for _ in range(30):
         fit = _fit(moved, truth, t, lag)
         size = float(fit.slope @ fit.slope)
         change = float(fit.slope @ fit.residual) / size if size > 0 else math.inf
-        lag += max(-raster, min(change, raster))
+        lag += max(-truth.half / COARSE, min(change, truth.half / COARSE))
         if abs(change) < 1e-9:
             break
         if abs(lag - coarse) > truth.half:

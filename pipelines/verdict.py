@@ -120,7 +120,7 @@ _SENTENCES: dict[Verdict, str] = {
     Verdict.INNOVATIONS_FOLLOW_TURN: "the innovations in x follow the rate of turn: the images' stamps are off",
     Verdict.INPUT_STALE: "the last speed or rate of turn is old; it is held",
     Verdict.INPUT_MISSING: "there is no speed or no rate of turn yet: landmarks cannot be carried on",
-    Verdict.INPUT_OUT_OF_ORDER: "a speed or rate of turn came with a stamp before that of an earlier one",
+    Verdict.INPUT_OUT_OF_ORDER: "a speed or rate of turn came late: after a later one, or after its frame",
     Verdict.INPUT_UNREADABLE: "a message with a speed or rate of turn could not be used",
 }
 

@@ -319,6 +319,20 @@ class LogRecording(Recording):
         groups = [self._read_group(g, wanted, start_ns, stop_ns) for g in self._clock_groups(wanted)]
         return groups[0] if len(groups) == 1 else merge(*groups)
 
+    def arrivals(self, streams: Sequence[str] | None = None) -> Iterator[Sample]:
+        """Yield samples in the order of the log, see `Recording.arrivals`."""
+        wanted = self._wanted(streams)
+        by_channel = {
+            channel: topic
+            for topic in self._topics
+            if any(info.name in wanted for info in topic.streams)
+            for channel in topic.channels
+        }
+        samples = (
+            sample for message in self._messages(by_channel) for sample in by_channel[message.channel].samples(message)
+        )
+        return (sample for sample in samples if sample.stream in wanted)
+
     def _wanted(self, streams: Sequence[str] | None) -> frozenset[str]:
         if streams is None:
             return frozenset(info.name for info in self.streams if info.readable)

@@ -1,6 +1,8 @@
 """The drift budget: exact sums, planted errors that rank first, gaps, slow references, and real replays."""
 
 import math
+import re
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -10,7 +12,7 @@ from numpy.typing import NDArray
 from pipelines.correlation.odometry import CorrelationOdometry
 from pipelines.correlation.settings import CorrelationSettings
 from pipelines.drift import DriftBudget, derived_headings, drift_budget
-from pipelines.evaluation import EvaluationError, Trajectory, evaluate
+from pipelines.evaluation import EvaluationError, Trajectory, evaluate, motions
 from pipelines.replay import replay
 from workbench import scenarios
 
@@ -275,3 +277,19 @@ def test_the_budget_of_a_scenario_sums_to_its_end_error(name: str) -> None:
     assert error > 0
     assert abs(budget.harm_m.sum() - error) < 0.01 * error
     assert np.hypot(*(end_vector(budget) - budget.end_error_m)) < 1e-9
+    rows = np.arange(len(estimate))
+    steps = motions(estimate.pose, rows[:-1], rows[1:])
+    for axis, size in ((0, 0.03), (2, 0.1)):  # an error of one frame, planted into what the estimator found
+        planted = steps.copy()
+        planted[19, axis] += size
+        start = (float(estimate.pose[0, 0]), float(estimate.pose[0, 1]), float(estimate.pose[0, 2]))
+        found = drift_budget(Trajectory(estimate.t_ns, chain(planted, start)), truth)
+        assert found.index[found.ranked()[0]] == 20
+        assert abs(found.harm_m.sum() - np.hypot(*found.end_error_m)) < 1e-9
+
+
+def test_the_code_on_the_page_of_evaluation_runs(capsys: pytest.CaptureFixture[str]) -> None:
+    page = (Path(__file__).parents[1] / "docs" / "evaluation.md").read_text(encoding="utf-8")
+    (block,) = re.findall(r"^```python\n(.*?)^```$", page, re.MULTILINE | re.DOTALL)
+    exec(compile(block, "evaluation.md", "exec"), {})
+    assert capsys.readouterr().out == "frame 31: 0.350 m of 0.350 m\n"

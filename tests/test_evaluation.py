@@ -9,6 +9,7 @@ from evo.core import metrics, sync
 from evo.core.trajectory import PoseTrajectory3D
 from numpy.typing import NDArray
 
+from pipelines.consistency import Consistency
 from pipelines.evaluation import (
     EvaluationError,
     Trajectory,
@@ -16,6 +17,7 @@ from pipelines.evaluation import (
     associate,
     evaluate,
     path_lengths,
+    pose_nees,
     relative_error,
     round_down,
 )
@@ -306,6 +308,48 @@ def test_round_down_gives_one_two_five(value: float, nice: float) -> None:
 
 def test_path_lengths_sum_the_steps() -> None:
     np.testing.assert_allclose(path_lengths(np.array([[0.0, 0], [3, 4], [3, 4], [3, 5]])), [0, 5, 5, 6])
+
+
+# ---------------------------------------------------------------------------- consistency
+
+
+def noisy_drive(seed: int, sigma: Floats) -> tuple[Trajectory, Floats, Trajectory]:
+    """An estimate that starts elsewhere, turned, with its covariances by the chain rule; and its reference."""
+    rng = np.random.default_rng(seed)
+    true = np.tile([0.1, 0.02, 0.03], (40, 1))
+    made = true + rng.normal(0, 1, (40, 3)) * sigma
+    paths = []
+    for steps, start in ((made, (5.0, 3.0, 2.0)), (true, (0.0, 1.0, -0.5))):
+        poses, covariances = [np.array(start)], [np.zeros((3, 3))]
+        for x, y, turn in steps:
+            c, s = np.cos(poses[-1][2]), np.sin(poses[-1][2])
+            move = np.array([c * x - s * y, s * x + c * y, turn])
+            by_pose = np.array([[1, 0, -move[1]], [0, 1, move[0]], [0, 0, 1]])
+            by_step = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
+            covariances.append(by_pose @ covariances[-1] @ by_pose.T + by_step @ np.diag(sigma**2) @ by_step.T)
+            poses.append(poses[-1] + move)
+        paths.append((Trajectory.of(np.arange(41) * SECOND, np.array(poses)), np.array(covariances)))
+    return *paths[0], paths[1][0]
+
+
+def test_nees_of_poses_is_chi_squared() -> None:
+    sigma = np.array([0.004, 0.001, 0.002])
+    last = []
+    for seed in range(300):
+        index, nees = pose_nees(*noisy_drive(seed, sigma))
+        assert index.tolist() == list(range(41))
+        assert math.isnan(nees[0])  # nothing is uncertain at the start
+        assert np.isfinite(nees[1:]).all()
+        last.append(nees[-1])
+    found = Consistency.of(np.array(last), 3, confidence=0.999)
+    assert found.consistent, found
+    estimate, covariance, reference = noisy_drive(0, sigma)
+    covariance[7] = np.nan
+    _, halved = pose_nees(estimate, covariance / 2, reference)
+    assert halved[40] == pytest.approx(2 * last[0])
+    assert math.isnan(halved[7])
+    with pytest.raises(ValueError, match="for 41 poses"):
+        pose_nees(estimate, covariance[1:], reference)
 
 
 # ------------------------------------------------------------------------------- geometry

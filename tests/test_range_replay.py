@@ -260,3 +260,81 @@ def test_errors_are_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path)
     assert "no odometry" in problems[0]
     assert main(["settings", "-e", "range"]) == 0
     assert "max_landmarks" in capsys.readouterr().out
+
+
+# --------------------------------------------------------------------------- boards, late images
+
+
+def test_the_pose_of_a_board_is_the_reference_of_its_corners(tmp_path: Path) -> None:
+    """Corner 0 of the board is not surveyed landmark 0 of the scene, a post elsewhere."""
+    scenario = tmp_path / "board.toml"
+    scenario.write_text(BOARD, encoding="utf-8")
+    board = ("landmarks=chessboard", "board.columns=5", "board.rows=4", "sigma_speed=0.002")
+    request = Request(path=scenario, estimator="range", overrides=(*board, "board.square_m=0.1"), out=tmp_path / "out")
+    summary = run(request).summary
+    assert summary["reference"] == "the pose of the board, whose size was given"
+    assert [one["landmark"] for one in summary["ranging"]["per_landmark"]] == [0, 4, 15, 19]
+    assert summary["ranging"]["error"]["count"] > 10
+    assert abs(summary["ranging"]["error"]["bias_percent"]) < 5
+    unknown = run(dataclasses.replace(request, overrides=board, stop="0.5", name="unknown")).summary
+    assert "nothing tells where they are (a board's size would)" in unknown["reference"]
+
+
+BOARD = """
+duration_s = 4
+reference.timing.rate_hz = 20
+imu.timing.rate_hz = 50
+trajectory = { curve = "line", speed_kmh = 1.44, profile = "constant" }
+tracks.timing.rate_hz = 5
+odometer = { timing.rate_hz = 20, speed_density = 0.002 }
+front = { width_px = 320, height_px = 240, focal_px = 250, timing.rate_hz = 5 }
+
+[surroundings]
+landmarks_m = [[9.0, 1.1, 1.1]]
+chessboard = { columns = 5, rows = 4, square_m = 0.1, position_m = [3.0, 0.05, 0.8] }
+"""
+
+
+def test_late_frames_are_bad_until_they_have_the_delay_that_is_told(tmp_path: Path) -> None:
+    scenario = tmp_path / "weave.toml"
+    scenario.write_text(WEAVE, encoding="utf-8")
+    request = Request(
+        path=scenario,
+        estimator="range",
+        overrides=("tracks.sigma_px=0.3", "sigma_speed=0.002", "max_landmarks=12"),
+        image="none",
+        out=tmp_path / "out",
+        calibrate=True,
+    )
+    late = run(request).summary
+    told = late["calibration"]
+    assert late["suitability"][0].startswith("do not trust")
+    delay_s = told["time_offset"]["camera_delay_s"]
+    # the gyro's values are held for 10 ms, 5 ms in the mean
+    assert delay_s == pytest.approx(0.045, abs=0.007)
+    assert f"use --set camera_delay_s={delay_s:.3f}" in told["sentence"]
+    given = (*request.overrides, f"camera_delay_s={delay_s:.3f}")
+    right = run(dataclasses.replace(request, overrides=given, name="right")).summary
+    assert not right["suitability"][0].startswith("do not trust")
+    assert right["ranging"]["error"]["median_percent"] < 5 < late["ranging"]["error"]["median_percent"]
+    assert "none that could be told from 0" in right["calibration"]["sentence"]
+
+
+WEAVE = """
+duration_s = 10
+reference.timing.rate_hz = 50
+imu.timing.rate_hz = 100
+tracks = { timing = { rate_hz = 10, clock_offset_s = 0.05 }, noise_px = 0.3 }
+odometer = { timing.rate_hz = 20, speed_density = 0.002 }
+front = {}
+
+[trajectory]
+curve = "serpentine"
+parameters = { amplitude_m = 0.06, wavelength_m = 1.2 }
+speed_kmh = 1.08
+profile = "constant"
+
+[surroundings]
+landmarks_m = [[7.2, 1.6, 1.4], [7.6, -1.5, 0.9], [6.2, 1.3, 0.3], [7.8, -0.9, 0.3]]
+chessboard = { position_m = [7.0, 0.0, 0.8] }
+"""

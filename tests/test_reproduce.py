@@ -23,6 +23,8 @@ from workbench.reproduce import statements as said
 from workbench.reproduce.judged import Upshot
 from workbench.reproduce.ledger import Ledger
 from workbench.reproduce.measures import Accuracy, accuracy, block_ratio, relative_rms
+from workbench.reproduce.plans import Reproduced
+from workbench.reproduce.report import Results
 from workbench.reproduce.tasks import carried_out
 from workbench.settings import SettingsError
 
@@ -300,11 +302,11 @@ def folder(tmp_path_factory: pytest.TempPathFactory, small_ground: None) -> Path
 
 
 @pytest.fixture(scope="module")
-def done(folder: Path) -> paper_a.Reproduced:
+def done(folder: Path) -> Reproduced[Results]:
     return paper_a.reproduce(paper_a.Plan(out=folder, frames=60, jobs=1), lambda *_: None)
 
 
-def test_the_command_writes_report_tables_pictures_and_logs(done: paper_a.Reproduced, folder: Path) -> None:
+def test_the_command_writes_report_tables_pictures_and_logs(done: Reproduced[Results], folder: Path) -> None:
     assert not done.interrupted
     text = (folder / "report.md").read_text()
     for part in (
@@ -325,7 +327,7 @@ def test_the_command_writes_report_tables_pictures_and_logs(done: paper_a.Reprod
     assert not list(folder.glob("*.frames"))
 
 
-def test_what_is_logged_is_what_is_judged(done: paper_a.Reproduced, folder: Path) -> None:
+def test_what_is_logged_is_what_is_judged(done: Reproduced[Results], folder: Path) -> None:
     run = next(r for r in done.results.runs if r.cell.condition.name == "C4")
     drive = conditions.experiment_drive("gravel", run.cell.condition, 0, 60)
     direct = estimates.estimates(drive.recording, run.cell.settings(drive.truth[0]))
@@ -342,14 +344,14 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_finished_parts_are_found_again(done: paper_a.Reproduced, folder: Path) -> None:
+def test_finished_parts_are_found_again(done: Reproduced[Results], folder: Path) -> None:
     told: list[tuple[str, int, int]] = []
     again = paper_a.reproduce(paper_a.Plan(out=folder, frames=60, jobs=1), lambda *args: told.append(args))
     assert told == []
     assert report.values(again.results) == report.values(done.results)
 
 
-def test_the_numbers_are_those_of_the_settings(done: paper_a.Reproduced, folder: Path) -> None:
+def test_the_numbers_are_those_of_the_settings(done: Reproduced[Results], folder: Path) -> None:
     run = done.results.runs[0]
     larger = dataclasses.replace(run.cell, overrides=("fragment_side_px=21",))
     assert experiment.kept(larger, folder) is None
@@ -437,7 +439,7 @@ def test_every_case_of_the_limits_is_in_a_table_once() -> None:
     assert len(set(cases)) == len(cases) == sum(counts.values()) - 2 * 2
 
 
-def test_pictures_are_the_same_for_the_same_numbers(done: paper_a.Reproduced, tmp_path: Path) -> None:
+def test_pictures_are_the_same_for_the_same_numbers(done: Reproduced[Results], tmp_path: Path) -> None:
     run = done.results.runs[0]
     for name in ("one", "two"):
         drawing.save(tmp_path / name, lambda: drawn.errors(run))
@@ -446,7 +448,7 @@ def test_pictures_are_the_same_for_the_same_numbers(done: paper_a.Reproduced, tm
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_cli_prints_tables_or_json(done: paper_a.Reproduced, folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+def test_cli_prints_tables_or_json(done: Reproduced[Results], folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
     command = ["reproduce", "paper-a", "-o", str(folder), "--frames", "60", "--jobs", "1"]
     assert cli.main(command) == 0
     out = capsys.readouterr().out

@@ -1,8 +1,11 @@
 """Paper B's experiments: the command on few runs, statements that follow numbers, a replica that is what it says."""
 
 import csv
+import dataclasses
 import json
 import math
+import shutil
+import tomllib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -11,13 +14,15 @@ import pytest
 from matplotlib.figure import Figure
 
 from pipelines.ranging import montecarlo as mc
-from pipelines.ranging.inputs import Synchronisation
-from workbench import cli
+from pipelines.ranging.step import RangeStep
+from workbench import cli, inputs, rrd, scenarios
 from workbench.reproduce import drawing, paper_b
 from workbench.reproduce.judged import Upshot
-from workbench.reproduce.ranging import report, robot
+from workbench.reproduce.plans import Reproduced
+from workbench.reproduce.ranging import replica, report, robot
 from workbench.reproduce.ranging import simulation as sim
 from workbench.reproduce.ranging import statements as said
+from workbench.reproduce.ranging.results import Results
 from workbench.reproduce.ranging.robot import Robot
 from workbench.reproduce.ranging.simulation import Accuracy
 from workbench.settings import SettingsError
@@ -47,7 +52,7 @@ def folder(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 @pytest.fixture(scope="module")
-def done(folder: Path) -> paper_b.Reproduced:
+def done(folder: Path) -> Reproduced[Results]:
     return paper_b.reproduce(paper_b.Plan(out=folder, runs=RUNS, seeds=SEEDS), lambda *_: None)
 
 
@@ -60,7 +65,7 @@ def undrawn(monkeypatch: pytest.MonkeyPatch) -> None:
 # ------------------------------------------------------------------------------- the command
 
 
-def test_the_command_writes_report_tables_and_pictures(done: paper_b.Reproduced, folder: Path) -> None:
+def test_the_command_writes_report_tables_and_pictures(done: Reproduced[Results], folder: Path) -> None:
     assert not done.interrupted
     text = done.file.read_text()
     for part in (
@@ -91,7 +96,7 @@ def test_the_command_writes_report_tables_and_pictures(done: paper_b.Reproduced,
     assert float(rows[-1]["median"]) == pytest.approx(100 * values["robot"]["table"][-1]["median"], abs=0.005)
 
 
-def test_the_values_are_those_of_the_monte_carlo(done: paper_b.Reproduced) -> None:
+def test_the_values_are_those_of_the_monte_carlo(done: Reproduced[Results]) -> None:
     accuracy, better = done.results.accuracy, done.results.better
     assert accuracy is not None
     assert better is not None
@@ -103,7 +108,7 @@ def test_the_values_are_those_of_the_monte_carlo(done: paper_b.Reproduced) -> No
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_finished_parts_are_found_again(done: paper_b.Reproduced, folder: Path) -> None:
+def test_finished_parts_are_found_again(done: Reproduced[Results], folder: Path) -> None:
     told: list[tuple[str, int, int]] = []
     plan = paper_b.Plan(out=folder, runs=RUNS, seeds=SEEDS)
     again = paper_b.reproduce(plan, lambda *args: told.append(args))
@@ -117,7 +122,7 @@ def test_finished_parts_are_found_again(done: paper_b.Reproduced, folder: Path) 
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_parts_of_another_plan_are_not_taken(folder: Path, done: paper_b.Reproduced, tmp_path: Path) -> None:
+def test_parts_of_another_plan_are_not_taken(folder: Path, done: Reproduced[Results], tmp_path: Path) -> None:
     (tmp_path / "parts").mkdir()
     for file in (folder / "parts").iterdir():
         (tmp_path / "parts" / file.name).write_bytes(file.read_bytes())
@@ -170,7 +175,7 @@ def test_command_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: p
 # ----------------------------------------------------------------------------- the replica
 
 
-def test_the_replica_is_what_the_paper_describes(done: paper_b.Reproduced) -> None:
+def test_the_replica_is_what_the_paper_describes(done: Reproduced[Results]) -> None:
     found = done.results.robot
     assert found is not None
     facts, run = found.facts, found.run
@@ -183,33 +188,93 @@ def test_the_replica_is_what_the_paper_describes(done: paper_b.Reproduced) -> No
     reached = {L: time[np.argmax(scale >= L)] - facts.start_s for L in robot.TABLE_3}
     assert 1.5 <= reached[0.042] <= 2.2  # where the paper's filter has just converged
     assert reached[0.23] + facts.start_s < 20
-    assert speed.min() < -0.1 < 0.1 < speed.max()  # forth, and back in reverse
+    assert np.nanmin(speed) < -0.1 < 0.1 < np.nanmax(speed)  # forth, and back in reverse
     assert len(found.converged_s) == SEEDS
 
 
-def test_vectors_of_the_robot_in_camera_axes() -> None:
-    np.testing.assert_array_equal(robot.in_camera(np.array([1.0, 0, 0])), [0, 0, 1])  # ahead
-    np.testing.assert_array_equal(robot.in_camera(np.array([0, 0, 1.0])), [0, -1, 0])  # to the left is about -y
-
-
 def test_the_filter_ranges_the_upper_left_corner() -> None:
-    found = robot.drive(3, 12.0)
-    seen = found.corners[:, 0]
-    matrix = found.camera.matrix
+    found = replica.drive(3, 12.0)
+    matrix, corner = found.mission.camera.matrix, found.corner
+    seen = np.array([sample.points_px[sample.ids == corner][0] for sample in found.tracks])
     expected = matrix[0, 0] * found.point_m[:, :2] / found.point_m[:, 2:] + matrix[:2, 2]
     assert np.std(seen - expected) == pytest.approx(0.1, rel=0.2)
-    assert (np.nanmin(found.corners, axis=1) >= seen - 0.8).all()  # no other corner is farther up or left
-    depths = robot.board_depths(found)
-    np.testing.assert_allclose(depths, found.point_m[:, 2], rtol=4e-3)
-    estimate = robot.ranged(found)
+    others = np.array([sample.points_px[sample.ids > corner].min(axis=0) for sample in found.tracks])
+    assert (others >= seen - 0.8).all()  # no other corner is farther up or left
+    estimate = replica.ranged(found, robot.WAYS[robot.HERE])
+    assert len(estimate.mean) == len(found.frame_s)
     assert estimate.depth_m[0] == pytest.approx(1.5 * found.point_m[0, 2])
     off = estimate.depth_m / found.point_m[:, 2] - 1
     assert abs(off[-1]) < 0.02
     assert (np.abs(1 / found.point_m[:, 2] - estimate.mean[:, 2]) < 4 * estimate.sigma_xi).all()
+    np.testing.assert_allclose(1 / estimate.interval_m[:, 0], estimate.mean[:, 2] + 2 * estimate.sigma_xi)
     still = np.flatnonzero(found.way_m == 0)
     assert estimate.sigma_xi[still[-1]] > 0.99 * estimate.sigma_xi[0]  # nothing is learnt at a stop
-    printed = robot.ranged(found, Synchronisation.AS_PRINTED, stops=False)
+    np.testing.assert_allclose(estimate.speed[1:], np.diff(found.way_m) / np.diff(found.frame_s), atol=0.03)
+    printed = replica.ranged(found, robot.WAYS[robot.PRINTED])
     assert abs(printed.depth_m[-1] / found.point_m[-1, 2] - 1) > 0.5
+
+
+def test_the_board_tells_the_range() -> None:
+    found = replica.drive(3, 12.0)
+    depths = replica.board_depths(found)
+    np.testing.assert_allclose(depths, found.point_m[:, 2], rtol=4e-3)
+    # where the board's other corners are not seen, or the corner itself is not, the range is unknown
+    few, without = found.tracks[0], found.tracks[1]
+    few = dataclasses.replace(few, ids=few.ids[: found.corner + 3], points_px=few.points_px[: found.corner + 3])
+    kept = without.ids != found.corner
+    without = dataclasses.replace(without, ids=without.ids[kept], points_px=without.points_px[kept])
+    less = replica.board_depths(dataclasses.replace(found, tracks=(few, without, found.tracks[2])))
+    np.testing.assert_array_equal(less, [np.nan, np.nan, depths[2]])
+
+
+def test_a_landmark_without_a_slot_is_unknown() -> None:
+    found = replica.drive(3, 1.0)
+    steps = [item.step for item in replica.steps_of(found, robot.WAYS[robot.HERE])]
+    nobody = replica.Ranged.of(steps, 99)
+    assert np.isnan(nobody.mean).all()
+    assert nobody.covariance.shape == (len(steps), 3, 3)
+
+
+def test_the_log_is_that_of_a_replay(done: Reproduced[Results], folder: Path) -> None:
+    found = done.results.robot
+    assert found is not None
+    drive = replica.drive(replica.LOGGED_SEED)
+    np.testing.assert_array_equal(found.run.estimate_m, replica.ranged(drive, robot.WAYS[robot.HERE]).depth_m)
+    log = robot.log_folder(folder)
+    read = replica.Ranged.of(rrd.read_steps(log / "best.rrd", "best", RangeStep), drive.corner)
+    np.testing.assert_array_equal(read.depth_m, found.run.estimate_m)
+    scenario = Path("sim:paper-b")
+    digest = inputs.digest_of(scenarios.open_scenario(scenario), scenario)
+    for preset in ("best", "paper-b"):
+        written = tomllib.loads((log / f"{preset}.toml").read_text())
+        assert written["complete"]
+        assert (log / f"{preset}.rrd").is_file()
+        assert written["run"]["digest"] == digest
+        assert written["settings"]["start_range_m"] == pytest.approx(1.5 * drive.point_m[0, 2])
+    assert "`workbench view`" in done.file.read_text()
+
+
+@pytest.mark.usefixtures("undrawn")
+def test_a_lost_log_is_made_again(
+    done: Reproduced[Results], folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(folder, tmp_path, dirs_exist_ok=True)
+    lost = robot.log_folder(tmp_path) / "paper-b.rrd"
+    plan = paper_b.Plan(out=tmp_path, runs=RUNS, seeds=SEEDS)
+    (work,) = [work for work in paper_b.works(plan) if work.name == "robot"]
+    assert lost in work.files
+
+    def made_again(_: object) -> Robot:
+        lost.touch()
+        assert done.results.robot is not None
+        return done.results.robot
+
+    monkeypatch.setattr(paper_b, "works", lambda _: [dataclasses.replace(work, make=made_again)])
+    paper_b.reproduce(plan, lambda *_: None)
+    assert lost.stat().st_size  # it was there
+    lost.unlink()
+    paper_b.reproduce(plan, lambda *_: None)
+    assert not lost.stat().st_size
 
 
 def test_convergence_is_for_good() -> None:
@@ -257,7 +322,7 @@ def test_statements_on_table_3_follow_the_numbers() -> None:
     assert said.worst_column([good, bad, lucky]).upshot is Upshot.MISSED
 
 
-def test_statements_on_the_robot_follow_the_numbers(done: paper_b.Reproduced) -> None:
+def test_statements_on_the_robot_follow_the_numbers(done: Reproduced[Results]) -> None:
     found = done.results.robot
     assert found is not None
 
@@ -274,7 +339,7 @@ def test_statements_on_the_robot_follow_the_numbers(done: paper_b.Reproduced) ->
     assert upshots()[-1] is Upshot.MISSED
 
 
-def test_statements_on_figures_and_bars_follow_the_numbers(done: paper_b.Reproduced) -> None:
+def test_statements_on_figures_and_bars_follow_the_numbers(done: Reproduced[Results]) -> None:
     results = done.results
     assert results.convergence is not None
     assert results.consistency is not None
@@ -297,7 +362,7 @@ def test_statements_on_figures_and_bars_follow_the_numbers(done: paper_b.Reprodu
     assert [s.upshot for s in said.of_scaling(off)] == ["missed", "reached", "reached"]
 
 
-def test_every_misprint_has_its_row(done: paper_b.Reproduced) -> None:
+def test_every_misprint_has_its_row(done: Reproduced[Results]) -> None:
     found = done.results.misprints
     assert found is not None
     assert found.row("right").rms == 1.0

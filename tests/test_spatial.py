@@ -14,6 +14,7 @@ from evo.core.trajectory import PoseTrajectory3D
 from evo.tools import file_interface
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
+from scipy.stats import chi2
 
 from pipelines import evaluation as planar
 from pipelines.consistency import Consistency, band, nees_of
@@ -65,14 +66,18 @@ def as_evo(path: SpatialPath, file: Path) -> PoseTrajectory3D:
     return file_interface.read_tum_trajectory_file(file)
 
 
-@pytest.fixture(params=["space", "plane"])
+@pytest.fixture(params=["space", "plane", "late"])
 def pair(request: Any, tmp_path: Path) -> tuple[SpatialPath, SpatialPath, PoseTrajectory3D, PoseTrajectory3D]:
     """Associated estimate and reference, ours and evo's, by way of TUM files."""
     estimate, reference = flight(1, plane=request.param == "plane")
+    offset_ns = -250_000_000 if request.param == "late" else 0
+    estimate = SpatialPath(estimate.t_ns - offset_ns, estimate.position_m, estimate.quat_xyzw)
     theirs_reference, theirs = as_evo(reference, tmp_path / "r.tum"), as_evo(estimate, tmp_path / "e.tum")
-    theirs_reference, theirs = sync.associate_trajectories(theirs_reference, theirs, max_diff=0.001)
+    theirs_reference, theirs = sync.associate_trajectories(
+        theirs_reference, theirs, max_diff=0.001, offset_2=offset_ns / 1e9
+    )
     back = read_tum(tmp_path / "e.tum"), read_tum(tmp_path / "r.tum")
-    ours, truth = associated(*back, method="nearest", max_gap_ns=1_000_000)
+    ours, truth = associated(*back, offset_ns=offset_ns, method="nearest", max_gap_ns=1_000_000)
     assert len(ours) == theirs.num_poses == len(estimate)
     return ours, truth, theirs, theirs_reference
 
@@ -136,6 +141,17 @@ def test_pairs_of_metres_are_evos_even_where_nothing_moves(every: bool, delta: f
     expected = filters.filter_pairs_by_path(poses, delta, 0.1 * delta, every)
     along = poses[:, 0, 3]
     assert pairs_by_measure(along, delta, every=every).tolist() == [list(p) for p in expected]
+
+
+def test_pairs_that_cannot_be() -> None:
+    assert pairs_by_frames(5, 5).tolist() == pairs_by_frames(0, 1, every=False).tolist() == []
+    for every in (True, False):
+        assert pairs_by_measure(np.array([0.0]), 1.0, every=every).shape == (0, 2)
+        assert pairs_by_measure(np.array([]), 1.0, every=every).shape == (0, 2)
+        with pytest.raises(ValueError, match="delta"):
+            pairs_by_frames(5, 0, every=every)
+        with pytest.raises(ValueError, match="delta"):
+            pairs_by_measure(np.zeros(3), 0.0, every=every)
 
 
 @pytest.mark.parametrize("offset_s", [0.0, 0.05])
@@ -307,6 +323,7 @@ def test_consistency_of_right_and_of_overconfident_covariances() -> None:
     right = Consistency.of(np.append(squared, np.nan), 3)
     assert (right.consistent, right.count, right.expected) == (True, 500, 3.0)
     assert (right.low, right.high) == band(3, 500)
+    assert band(3, 500) == pytest.approx((chi2.ppf(0.025, 1500) / 500, chi2.ppf(0.975, 1500) / 500), rel=1e-12)
     proud = Consistency.of(nees_of(error, np.tile(covariance / 2, (500, 1, 1))), 3)
     assert not proud.consistent
     assert proud.ratio == pytest.approx(2 * right.ratio)

@@ -162,6 +162,9 @@ class ToyRun(TextLog):
         assert len(frames) == len(t_ns) == len(values)
         self._say("errors", len(frames), int(frames[0]), int(frames[-1]))
 
+    def smoothed(self, slot: int, frames: Any, t_ns: Any, mean: Any, covariance: Any) -> None:
+        self._say("smoothed", slot, len(frames))
+
     def finish(self, summary: Mapping[str, Any], aligned_path: Any) -> None:
         self._say("finish", None if aligned_path is None else len(aligned_path), *summary)
 

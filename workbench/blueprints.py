@@ -79,6 +79,7 @@ class Bounds:
         image_px: width and height of the image.
         surfaces_px: width and height of the mosaic of correlation surfaces.
         landmarks: of the range filter: slot, name, and upper end of the plot of ranges in m (0: the viewer's choice).
+        smoothed: slots, from 1, of which there are smoothed ranges.
     """
 
     frames: tuple[int, int] | None = None
@@ -86,6 +87,7 @@ class Bounds:
     image_px: tuple[float, float] | None = None
     surfaces_px: tuple[float, float] | None = None
     landmarks: tuple[tuple[int, str, float], ...] = ()
+    smoothed: frozenset[int] = frozenset()
 
 
 def sensor_blueprint(bounds: Bounds) -> rrb.Blueprint:
@@ -251,6 +253,12 @@ def _landmark_plots(root: str, bounds: Bounds) -> rrb.Tabs:
         }
         return plot(title, [*entities, *more], top=top, overrides=looks)
 
+    def beside(slot: int, entity: str) -> list[str]:
+        """What the plot of one landmark shows besides."""
+        if entity == "range" and slot in bounds.smoothed:
+            return [f"{root}/smoothed/{slot}/range"]
+        return [chi2] if entity == "nis" else []
+
     chi2 = f"{root}/bounds/nis"
     highest = max((top for _, _, top in bounds.landmarks), default=0.0)
     all_of_them = rrb.Grid(
@@ -267,8 +275,8 @@ def _landmark_plots(root: str, bounds: Bounds) -> rrb.Tabs:
         rrb.Grid(
             *(
                 plot(
-                    title,
-                    [f"{root}/landmark/{slot}/{entity}", *([chi2] if entity == "nis" else [])],
+                    title + (", smoothed purple" if entity == "range" and slot in bounds.smoothed else ""),
+                    [f"{root}/landmark/{slot}/{entity}", *beside(slot, entity)],
                     top={"range": top, "nis": 4 * 5.99, "relative_sigma": 0.5}.get(entity, 0.0),
                 )
                 for entity, title in _ONE

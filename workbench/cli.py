@@ -39,9 +39,10 @@ from workbench.terminal import (
 if TYPE_CHECKING:
     from pipelines.simulation.mission import SimulatedMission
     from readers.streams import Camera, ReadOptions, Recording, StreamInfo
-    from workbench.reproduce import paper_b
+    from workbench.reproduce import report as reports_a
     from workbench.reproduce.judged import Statement
-    from workbench.reproduce.paper_a import Reproduced
+    from workbench.reproduce.plans import Reproduced
+    from workbench.reproduce.ranging.results import Results as RangeResults
     from workbench.session import Outcome, Request
 
 
@@ -286,6 +287,9 @@ def replay(
             help="Tell the scale and mounting yaw that fit; with -e range: gyro bias, focus, delay.",
         ),
     ] = False,
+    smooth: Annotated[
+        bool, typer.Option("--smooth", help="With -e range: the best ranges after the mission, from all of it.")
+    ] = False,
     raw_images: Annotated[str, typer.Option(metavar="FORM", help="Keep raw images as png or raw.")] = "png",
     rate: Rate = None,
     times: TimesFile = None,
@@ -322,6 +326,7 @@ def replay(
         height=height,
         options=_options(rate, times, times_unit, tf),
         calibrate=calibrate,
+        smooth=smooth,
         raw_images=_one_of(raw_images, ("png", "raw"), "--raw-images"),
     )
     _conclude(_replay(request), as_json)
@@ -628,12 +633,12 @@ app.add_typer(reproduce, name="reproduce", short_help="Repeat a paper's experime
         "workbench reproduce paper-a --seeds 5",
         "workbench reproduce paper-a --matrix --limits",
         "workbench reproduce paper-a --surface floor.png --frames 600 -o results/floor",
-        "workbench reproduce paper-a --set fragment_side_px=21 -o results/paper-a-21",
+        "workbench reproduce paper-a --set fragment_side_px=21 -o results/reproduce-paper-a-21",
     ),
 )
 def reproduce_paper_a(
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of the results.")] = Path(
-        "results/paper-a"
+        "results/reproduce-paper-a"
     ),
     surface: Annotated[
         str | None, typer.Option(metavar="NAME|PICTURE", help="The ground [gravel; all for matrix and limits].")
@@ -668,11 +673,7 @@ def reproduce_paper_a(
     )
     with Bars() as bars:
         done = paper_a.reproduce(plan, bars)
-    if as_json:
-        print_json(report.values(done.results) | {"folder": str(done.folder), "interrupted": done.interrupted})
-    else:
-        _print_reproduced(done)
-    raise typer.Exit(INTERRUPTED if done.interrupted else 0)
+    _end_reproduced(done, report.values(done.results) if as_json else None, _print_reproduced)
 
 
 def _as_typed(
@@ -696,7 +697,16 @@ def _as_typed(
     return shlex.join(words)
 
 
-def _print_reproduced(done: Reproduced) -> None:
+def _end_reproduced(done: Reproduced[Any], values: Mapping[str, Any] | None, show: Callable[[Any], None]) -> NoReturn:
+    """Print the values of an experiment as JSON, or show it where there are none; and exit."""
+    if values is not None:
+        print_json({**values, "folder": str(done.folder), "interrupted": done.interrupted})
+    else:
+        show(done)
+    raise typer.Exit(INTERRUPTED if done.interrupted else 0)
+
+
+def _print_reproduced(done: Reproduced[reports_a.Results]) -> None:
     """Print the tables and statements of an experiment for people."""
     from workbench.reproduce import report
 
@@ -735,7 +745,7 @@ def _print_statements(statements: Iterable[Statement], unfinished: Iterable[str]
 )
 def reproduce_paper_b(
     out: Annotated[Path, typer.Option("--out", "-o", metavar="DIR", help="Folder of the results.")] = Path(
-        "results/paper-b"
+        "results/reproduce-paper-b"
     ),
     runs: Annotated[int, typer.Option(metavar="N", help="Runs of each Monte Carlo; the paper has 1000.")] = 4000,
     seeds: Annotated[int, typer.Option(metavar="N", help="Runs of the robot's replica.")] = 40,
@@ -743,8 +753,8 @@ def reproduce_paper_b(
 ) -> None:
     """Repeat paper B's Tables 1-3 and Figs 6-8, 10-12 beside the paper's numbers, with bounds and consistency.
 
-    The folder then holds report.md with tables and pictures, and the same values as JSON and CSV. Ctrl-C leaves
-    the finished parts; the same command goes on with the others.
+    The folder then holds report.md with tables and pictures, the same values as JSON and CSV, and a log of one run
+    of the robot for the viewer. Ctrl-C leaves the finished parts; the same command goes on with the others.
     """
     import shlex
 
@@ -755,14 +765,10 @@ def reproduce_paper_b(
     plan = paper_b.Plan(out=out, runs=runs, seeds=seeds, command=shlex.join(words))
     with Bars() as bars:
         done = paper_b.reproduce(plan, bars)
-    if as_json:
-        print_json(report.values(done.results) | {"folder": str(done.folder), "interrupted": done.interrupted})
-    else:
-        _print_ranges(done)
-    raise typer.Exit(INTERRUPTED if done.interrupted else 0)
+    _end_reproduced(done, report.values(done.results) if as_json else None, _print_ranges)
 
 
-def _print_ranges(done: paper_b.Reproduced) -> None:
+def _print_ranges(done: Reproduced[RangeResults]) -> None:
     """Print the tables and statements of paper B's experiments for people."""
     from workbench.reproduce.ranging import report
     from workbench.reproduce.ranging.statements import statements
@@ -770,6 +776,8 @@ def _print_ranges(done: paper_b.Reproduced) -> None:
     for name, (heads, rows) in report.tables(done.results).items():
         print("\n".join((name, *table(heads, rows))), end="\n\n")
     _print_statements(statements(done.results), done.results.unfinished, done.file)
+    if done.results.robot:
+        print(f"log     workbench view {done.results.log}")
 
 
 # ------------------------------------------------------------------------------- settings

@@ -25,6 +25,7 @@ from pipelines.ranging.step import RangeStep
 from readers.streams import Camera, Landmark, StreamKind
 from workbench.inputs import Reference
 from workbench.range_calibration import SensorCalibration
+from workbench.range_smoothing import COVERED_SIGMAS, Smoothing, error_values
 from workbench.range_traces import GATE, Beside, RangeScene
 from workbench.settings import Resolved
 from workbench.summary import Tally, range_suitability
@@ -37,7 +38,6 @@ if TYPE_CHECKING:
 
 Floats = NDArray[np.float64]
 
-COVERED_SIGMAS = 2.0
 BAND = 0.95
 """Share of right filters whose mean NIS lies within the band."""
 MAX_GAP_S = 1.0
@@ -81,6 +81,7 @@ class RangeAccount:
         offset_ns: added to the frames' times to find the reference.
         degrees: of freedom of an image point.
         sensors: collects what tells of the sensors; None where nobody asked.
+        smoothing: smooths the run at its end; None where nobody asked.
     """
 
     trajectory = False
@@ -95,11 +96,12 @@ class RangeAccount:
         offset_ns: int = 0,
         degrees: int = 2,
         sensors: SensorCalibration | None = None,
+        smoothing: Smoothing | None = None,
     ) -> None:
         self.scene = scene
         self._ranges, self._poses, self._body_t_camera = ranges, poses, body_t_camera
         self._sentence, self._offset_ns, self._degrees = sentence, offset_ns, degrees
-        self._sensors = sensors
+        self._sensors, self.smoothing = sensors, smoothing
         self._lives: dict[int, Life] = {}
         self._carried = self._measured = self._converged = 0
 
@@ -113,10 +115,13 @@ class RangeAccount:
         offset_ns: int,
         *,
         calibrate: bool = False,
+        smooth: bool = False,
     ) -> RangeAccount:
         """The account of a replay with these settings and this reference."""
         settings: Any = resolved.settings
         bearings = streams.kind is StreamKind.LANDMARKS
+        found_in_images = streams.kind is StreamKind.IMAGE
+        known = {} if found_in_images else landmarks  # what is found in images has numbers of its own
         body_t_camera = np.eye(4)
         body_t_camera[:3, :3] = settings.body_r_camera
         body_t_camera[:3, 3] = settings.camera_position_m or (0.0, 0.0, 0.0)
@@ -125,7 +130,7 @@ class RangeAccount:
         board = _board_of(resolved)
         ranges = ReferenceRanges(
             _placed(own, body_t_camera),
-            landmarks=landmarks,
+            landmarks=known,
             pose_stream=reference.stream or "none",
             board=board,
             max_gap_s=MAX_GAP_S,
@@ -143,21 +148,24 @@ class RangeAccount:
         )
         if own is not None and not undistorted(own):
             scene = dataclasses.replace(scene, on_image=lambda points: _seen(own, points))
-        sentence = _sentence(reference, landmarks, bearings, board is not None)
+        sentence = _sentence(reference, known, bearings, board is not None, found_in_images)
         sensors = SensorCalibration(settings, bool(streams.imu)) if calibrate else None
-        return cls(scene, ranges, poses, body_t_camera, sentence, offset_ns, 1 if bearings else 2, sensors)
+        smoothing = Smoothing(settings) if smooth else None
+        return cls(scene, ranges, poses, body_t_camera, sentence, offset_ns, 1 if bearings else 2, sensors, smoothing)
 
     # ---- step by step
 
     def take(self, step: Step, sample: Frame) -> Beside:
         """Follow the landmarks of one step; what the reference says of its frame."""
         assert isinstance(step, RangeStep)
-        self._ranges.take(sample)
+        self._ranges.take(dataclasses.replace(sample, t_ns=step.t_ns))  # as the estimator dates it
         if self._sensors is not None:
             self._sensors.take(step)
         ids = np.nan_to_num(step.landmark_id, nan=-1).astype(np.int64)
         depth = self._ranges.at(step.t_ns + self._offset_ns, ids).depth_m
         depth = np.where(depth > 0, depth, np.nan)
+        if self.smoothing is not None:
+            self.smoothing.take(depth)
         self._carried += step.landmarks
         self._measured += step.measured
         self._converged += step.converged
@@ -216,6 +224,7 @@ class RangeAccount:
             "reference": self._sentence if ranging["error"] else self._without(),
             "ranging": ranging,
             "evaluation": None,
+            "smoothed": None if self.smoothing is None else self.smoothing.told(),
             "calibration": None if self._sensors is None else self._sensors.told(),
             "suitability": range_suitability(tally, ranging),
         }, None
@@ -248,17 +257,7 @@ class RangeAccount:
 def _errors(lives: list[Life]) -> dict[str, float] | None:
     """Relative errors of the ranges that counted, in percent, and their consistency; None where none is known."""
     errors = np.concatenate([np.zeros(0), *(np.frombuffer(life.errors) for life in lives)])
-    count = len(errors)
-    if not count:
-        return None
-    return {
-        "count": count,
-        "median_percent": 100 * float(np.median(np.abs(errors))),
-        "rms_percent": 100 * float(np.sqrt(np.mean(errors**2))),
-        "bias_percent": 100 * float(np.median(errors)),
-        "nees": sum(life.nees for life in lives) / count,
-        "coverage": sum(life.covered for life in lives) / count,
-    }
+    return error_values(errors, sum(life.nees for life in lives), sum(life.covered for life in lives))
 
 
 def _placed(camera: Camera | None, body_t_camera: Floats) -> Camera:
@@ -297,14 +296,16 @@ def _seen(camera: Camera, points_px: Floats) -> Floats:
 def _board_of(resolved: Resolved) -> BoardSettings | MarkerSettings | None:
     """The board whose pose tells ranges: where its size was given."""
     settings: Any = resolved.settings
-    if settings.landmarks is LandmarkKind.CHESSBOARD and "board" in resolved.given:
+    if settings.landmarks is LandmarkKind.CHESSBOARD and settings.board.square_m is not None:
         return cast(BoardSettings, settings.board)
     if settings.landmarks is LandmarkKind.ARUCO and "markers" in resolved.given:
         return cast(MarkerSettings, settings.markers)
     return None
 
 
-def _sentence(reference: Reference, landmarks: Mapping[int, Landmark], bearings: bool, board: bool) -> str:
+def _sentence(
+    reference: Reference, landmarks: Mapping[int, Landmark], bearings: bool, board: bool, found_in_images: bool
+) -> str:
     """What the reference ranges come from."""
     parts = []
     if landmarks and reference.poses:
@@ -315,6 +316,8 @@ def _sentence(reference: Reference, landmarks: Mapping[int, Landmark], bearings:
         parts.append("the pose of the board, whose size was given")
     if parts:
         return ", else ".join(parts)
+    if found_in_images:
+        return "none: the landmarks are found in the images, and nothing tells where they are (a board's size would)"
     if landmarks:
         return f"none: {len(landmarks)} surveyed landmarks, but {reference.sentence}"
     return f"none: no surveyed landmarks; reference poses: {reference.sentence}"

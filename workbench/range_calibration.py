@@ -26,6 +26,8 @@ MOVING_SIGMAS = 5.0
 SIGNIFICANT_SIGMAS = 3.0
 """A difference from the settings below that is none."""
 MAX_OFFSET_S = 0.5
+SIGMA_OFFSET_S = 0.005
+"""What the time offset is uncertain by: speeds are held over the intervals, and depths differ."""
 LEAST_CORRELATION = 0.9
 """Below it the image's turn and the gyro's do not resemble each other: no time offset is told."""
 DRAWS = 40
@@ -227,12 +229,16 @@ class SensorCalibration:
             )
         if MAX_OFFSET_S - abs(found.seconds) < 1e-3:
             raise ValueError(f"it lies at the end of the search, ± {MAX_OFFSET_S} s")
-        values = {"seconds": found.seconds, "correlation": found.correlation}
+        delay_s = s.camera_delay_s - found.seconds
+        values = {"seconds": found.seconds, "correlation": found.correlation, "camera_delay_s": delay_s}
         sign = "late" if found.seconds > 0 else "early"
-        return values, (
-            f"the gyro's stamps are {abs(found.seconds):.3f} s {sign} (about ± 0.01 s; correlation "
-            f"{found.correlation:.3f}); no setting shifts them: stamp the log anew if it is more than that"
+        sentence = (
+            f"the gyro's stamps are {abs(found.seconds):.3f} ± {SIGMA_OFFSET_S:g} s {sign} beside the frames' "
+            f"(correlation {found.correlation:.3f}): "
         )
+        if abs(found.seconds) < SIGNIFICANT_SIGMAS * SIGMA_OFFSET_S:
+            return values, sentence + "none that could be told from 0"
+        return values, sentence + f"use --set camera_delay_s={delay_s:.3f}"
 
 
 def _list(values: Sequence[float] | Floats, digits: int) -> str:

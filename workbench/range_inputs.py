@@ -14,6 +14,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from pipelines.latency import LatencyBuffer
+from pipelines.ranging.inputs import Synchronisation
 from pipelines.simulation.faults import FAULTS_STREAM
 from readers.streams import (
     Camera,
@@ -156,6 +158,22 @@ def _shown(recording: Recording, frames: str, wanted: str | None) -> str:
     folder = frames.rpartition("/")[0]
     found = [info.name for info in recording.of_kind(StreamKind.IMAGE) if info.name.rpartition("/")[0] == folder]
     return found[0] if len(found) == 1 else ""
+
+
+def latency_of(settings: Any, streams: Streams) -> LatencyBuffer | None:
+    """The buffer that sorts the samples as the settings say; None where the reader's order will do."""
+    buffer_ns = round(1e9 * getattr(settings, "latency_buffer_s", 0.0))
+    delay_ns = round(1e9 * getattr(settings, "camera_delay_s", 0.0))
+    if not buffer_ns and not delay_ns:
+        return None
+    frames = tuple(name for name in (streams.frames, streams.shown) if name)
+    return LatencyBuffer(
+        wait_ns=buffer_ns + abs(delay_ns),
+        frames=frames,
+        delay_ns=dict.fromkeys(frames, delay_ns),
+        by_arrival=buffer_ns > 0,
+        look_ahead=getattr(settings, "synchronisation", None) is Synchronisation.MIDPOINT,
+    )
 
 
 # ---------------------------------------------------------------------------------------- camera

@@ -15,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.ranging.equations import range_interval
 from pipelines.ranging.filter import Outcome, Status
 from workbench.traces import Columns, finite, table_form
 
@@ -235,6 +236,7 @@ class Plot(NamedTuple):
 
 
 BLUE, ORANGE, GREEN, GREY = 0x4FC3F7FF, 0xFFB74DFF, 0x2ECC71FF, 0x9E9E9EFF
+PURPLE = 0xCE93D8FF
 PLOTS = (
     Plot(
         "range",
@@ -266,6 +268,20 @@ PLOTS = (
     Plot("parallax", ("parallax [px]", "derotated [px]", "to the focus [px]"), (GREY, BLUE, ORANGE),
          (True, False, False)),
 )  # fmt: skip
+SMOOTHED = Plot(
+    "range",
+    ("smoothed Z [m]", "nearest [m]", "farthest [m]"),
+    (PURPLE, 0xCE93D8A0, 0xCE93D8A0),
+    (False, True, True),
+)
+
+
+def smoothed(mean: Floats, covariance: Floats) -> Floats:
+    """Z, nearest and farthest of n smoothed states [n, 3]; NaN where ξ says nothing of the range."""
+    xi = np.where(mean[:, 2] > 0.0, mean[:, 2], np.nan)
+    near, far = range_interval(xi, np.sqrt(covariance[:, 2, 2]))
+    values = np.stack([1.0 / xi, near, far], axis=-1)
+    return np.where(np.isfinite(values), values, np.nan)
 
 
 def plotted(table: Columns, reference_m: Floats, slots: int) -> dict[str, Floats]:

@@ -320,6 +320,19 @@ class RunWriter(_Writer):
         columns = rr.Scalars.columns(scalars=np.asarray(values, np.float64))
         self._file.send(f"{self._root}/error", np.asarray(frames, np.int64), np.asarray(t_ns, np.int64), columns)
 
+    def smoothed(self, slot: int, frames: Ints, t_ns: Ints, mean: Floats, covariance: Floats) -> None:
+        """Log what smoothing says of the landmarks in a slot, at n of its frames.
+
+        Args:
+            slot: from 0.
+            frames: numbers of the frames [n], rising.
+            t_ns: their times [n].
+            mean: x, y, ξ (px, px, 1/m) [n, 3].
+            covariance: of these [n, 3, 3].
+        """
+        self.flush()
+        self._drawing.smoothed(slot, frames, t_ns, mean, covariance)
+
     def finish(self, summary: Mapping[str, str | float | int], aligned_path: Floats | None) -> None:
         """Log what is known at the end: the summary, the whole path, and the path [n, 2] aligned with the reference."""
         self.flush()

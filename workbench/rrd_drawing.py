@@ -7,7 +7,7 @@ from typing import Any
 
 from workbench import traces
 from workbench.blueprints import Extent
-from workbench.rrd_file import IMAGE, Floats, RrdFile
+from workbench.rrd_file import IMAGE, Floats, Ints, RrdFile
 from workbench.schema import Schema
 
 
@@ -42,6 +42,9 @@ class Drawing:
 
     def write(self, table: traces.Columns, beside: Sequence[Any]) -> None:
         """Draw some steps; `beside` is what is known of each one's frame from elsewhere."""
+
+    def smoothed(self, slot: int, frames: Ints, t_ns: Ints, mean: Floats, covariance: Floats) -> None:
+        """Draw what smoothing says of the landmarks in a slot, see `RunWriter.smoothed`."""
 
     def finish(self, aligned_path: Floats | None, given: Extent | None) -> Mapping[str, Any]:
         """Draw what is known at the end; what is known by now for `Bounds`.

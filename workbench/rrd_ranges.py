@@ -35,6 +35,7 @@ class RangeDrawing(Drawing):
         self._tops: Floats = np.zeros(0)
         self._ids: dict[int, set[int]] = {}
         self._slots = 0
+        self._smoothed: set[int] = set()
 
     # ---- what is logged once
 
@@ -216,6 +217,20 @@ class RangeDrawing(Drawing):
 
     # ---- the end
 
+    def smoothed(self, slot: int, frames: Ints, t_ns: Ints, mean: Floats, covariance: Floats) -> None:  # noqa: D102
+        root = f"{self.root}/smoothed/{slot + 1}"
+        values = {"state": mean, "covariance": covariance.reshape(-1, 9), "range": ranges.smoothed(mean, covariance)}
+        for name, rows in values.items():
+            self.file.send(f"{root}/{name}", frames, t_ns, rr.Scalars.columns(scalars=np.ascontiguousarray(rows)))
+        plot = ranges.SMOOTHED
+        widths = [1.0 if thin else 2.0 for thin in plot.thin]
+        look = rr.SeriesLines(names=plot.series, colors=np.array(plot.colours, np.uint32), widths=widths)
+        self.file.static(f"{root}/range", look)
+        names = {"state": ["x [px]", "y [px]", "ξ [1/m]"], "covariance": [f"P {a}{b}" for a in "xyξ" for b in "xyξ"]}
+        for name, series in names.items():
+            self.file.static(f"{root}/{name}", rr.SeriesLines(names=series))
+        self._smoothed.add(slot + 1)
+
     def finish(self, aligned_path: Floats | None, given: Extent | None) -> Mapping[str, Any]:  # noqa: D102
         if not self._path:
             return {}
@@ -233,7 +248,7 @@ class RangeDrawing(Drawing):
         arrows = rr.Arrows3D.columns(vectors=vectors, origins=flat(way, "arrows"))
         self.file.send(f"{self.world}/camera/heading", frames[good], t_ns[good], arrows)
         self.file.static(f"{self.root}/slots", document(self._slot_table()))
-        return {"extent": extent, "landmarks": self._landmarks()}
+        return {"extent": extent, "landmarks": self._landmarks(), "smoothed": frozenset(self._smoothed)}
 
     def _landmarks(self) -> tuple[tuple[int, str, float], ...]:
         """Name and highest range of each slot with plots; slots that stayed empty are left out at the end."""

@@ -339,6 +339,8 @@ board, or measured ranges say; it is computed beside the estimator, which never 
 | `/runs/RUN/range/landmark/K/parallax` | parallax, derotated parallax, distance to the focus of expansion (px) |
 | `/runs/RUN/range/bounds/nis` | 5.99 (95 % of χ² with 2 degrees of freedom), 13.8 (99.9 %, the gate) |
 | `/runs/RUN/range/reference` | reference depth of every slot (m) |
+| `/runs/RUN/range/smoothed/K/range` | with `--smooth`: smoothed Z, nearest and farthest (ξ ± 2 σ_ξ) (m); every slot |
+| `/runs/RUN/range/smoothed/K/state`, `/covariance` | smoothed x, y, ξ (px, px, 1/m) and their P, row by row |
 | `/camera/image/RUN/measured`, `/predicted`, `/innovation`, `/gate`, `/focus` | drawn on the image |
 | `/camera/image/RUN/ranges` | the landmarks coloured by their range, red near, blue far |
 | `/world/runs/RUN/camera`, `/camera/path` | where the camera is: reference, else dead reckoned |

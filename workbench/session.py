@@ -29,6 +29,7 @@ import numpy as np
 from pipelines.estimator import Estimator, Step
 from pipelines.evaluation import Evaluation, EvaluationError, Trajectory, evaluate, mean_angle, path_lengths
 from pipelines.geometry import Floats, wrap_angle
+from pipelines.latency import LatencyBuffer
 from pipelines.replay import Frame, Replayed, replay
 from pipelines.verdict import Severity
 from readers.clock import StreamAudit
@@ -46,6 +47,7 @@ from readers.streams import (
 )
 from workbench import inputs, range_inputs
 from workbench.range_account import RangeAccount
+from workbench.range_smoothing import Smoothing
 from workbench.settings import Plugin, Resolved, SettingsError, plugin, resolve, settings_values, to_toml
 from workbench.summary import Tally, evaluation_values, lines, suitability
 from workbench.trajectory_files import tum_line_in_plane
@@ -87,6 +89,7 @@ class Request:
     imu: str | None = None
     options: ReadOptions = field(default_factory=ReadOptions)
     calibrate: bool = False
+    smooth: bool = False
     raw_images: str = "png"
 
 
@@ -128,6 +131,7 @@ class RunLog(Protocol):
     def step(self, step: Step, beside: Any = None) -> None: ...  # noqa: D102
     def event(self, frame: int, t_ns: int, severity: Severity, text: str) -> None: ...  # noqa: D102
     def errors(self, frames: Any, t_ns: Any, values: Floats) -> None: ...  # noqa: D102
+    def smoothed(self, slot: int, frames: Any, t_ns: Any, mean: Floats, covariance: Floats) -> None: ...  # noqa: D102
     def finish(self, summary: Mapping[str, str | float | int], aligned_path: Floats | None) -> None: ...  # noqa: D102
     def close(self) -> None: ...  # noqa: D102
 
@@ -227,6 +231,8 @@ def run(
     preset = request.preset or estimator.usual_preset
     resolved = resolve(estimator, preset=preset, file=request.settings_file, overrides=request.overrides)
     name = run_name(request.name or preset)
+    if request.smooth and estimator.answers != "ranges":
+        raise SettingsError(f"--smooth is for ranges, not for {request.estimator}: leave it out, or take -e range")
     if request.stride < 1:
         raise SettingsError(f"--stride {request.stride}: must be 1 or more")
     with recording or open_any(request.path, request.options) as opened:
@@ -271,10 +277,11 @@ def _prepare(
     """Make every choice that can fail before anything is written."""
     choose = _choose_for_ranges if estimator.answers == "ranges" else _choose_for_path
     chosen = choose(request, recording, resolved)
+    built: Any = estimator.build(chosen.resolved.settings)
     return _Session(
         request=request,
         recording=_Audited(recording),
-        estimator=estimator.build(chosen.resolved.settings),
+        estimator=built if chosen.smoothing is None else chosen.smoothing.watching(built),
         name=name,
         preset=preset,
         folder=run_folder(request),
@@ -298,7 +305,9 @@ class _Chosen:
     account: Account
     ground: Floats | None
     scene: Any = None
+    latency: LatencyBuffer | None = None
     notes: Sequence[str] = ()
+    smoothing: Smoothing | None = None
 
 
 def _choose_for_path(request: Request, recording: Recording, resolved: Resolved) -> _Chosen:
@@ -347,7 +356,9 @@ def _choose_for_ranges(request: Request, recording: Recording, resolved: Resolve
     camera = range_inputs.camera_of(recording, streams)
     resolved, notes = range_inputs.with_camera(resolved, recording, camera, streams)
     landmarks = range_inputs.landmarks_of(recording)
-    account = RangeAccount.of(resolved, landmarks, reference, streams, offset_ns, calibrate=request.calibrate)
+    account = RangeAccount.of(
+        resolved, landmarks, reference, streams, offset_ns, calibrate=request.calibrate, smooth=request.smooth
+    )
     return _Chosen(
         frames=streams.frames,
         others=streams.others,
@@ -359,6 +370,8 @@ def _choose_for_ranges(request: Request, recording: Recording, resolved: Resolve
         account=account,
         ground=None,
         scene=account.scene,
+        smoothing=account.smoothing,
+        latency=range_inputs.latency_of(resolved.settings, streams),
         notes=[*streams.notes, *notes],
     )
 
@@ -395,7 +408,13 @@ class _Audited(Recording):
     def read(
         self, streams: Sequence[str] | None = None, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Sample]:
-        for sample in self._inner.read(streams, start_ns, stop_ns):
+        return self._audited(self._inner.read(streams, start_ns, stop_ns))
+
+    def arrivals(self, streams: Sequence[str] | None = None) -> Iterator[Sample]:
+        return self._audited(self._inner.arrivals(streams))
+
+    def _audited(self, samples: Iterator[Sample]) -> Iterator[Sample]:
+        for sample in samples:
             if sample.stream not in self.audits:
                 self.audits[sample.stream] = StreamAudit(sample.stream)
             self.audits[sample.stream].add(sample)
@@ -573,6 +592,8 @@ class _Session:
                 if not tally.frames:
                     raise
                 stopped = str(error)
+            if self.chosen.smoothing is not None and tally.frames:
+                self.chosen.smoothing.conclude(run, lambda: interrupt.requested)
             summary = self._finish(sensors, run, tally, span, interrupt.requested, stopped)
         if sensors is not None and not summary["interrupted"] and not stopped:
             _replace(self.folder / "sensors.toml", to_toml(self._sensors_values()))
@@ -601,6 +622,7 @@ class _Session:
             start_ns=self.chosen.start_ns,
             stop_ns=self.chosen.stop_ns,
             stride=self.request.stride,
+            latency=self.chosen.latency,
             on_progress=tell,
         )
 
@@ -639,6 +661,8 @@ class _Session:
     ) -> dict[str, Any]:
         """Judge the run, log what is known at its end, and return the summary."""
         facts, damage = self.recording.facts(), self.recording.damage_lines()
+        if self.chosen.latency is not None:
+            facts += self.chosen.latency.facts()
         found, aligned = self.chosen.account.conclude(run, tally, span.median_dt_s)
         summary = self._summary(tally, span, found, interrupted, stopped) | {"facts": facts, "damage": damage}
         if tally.frames:

@@ -358,11 +358,30 @@ def _range_lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     ]
     if found["error"] is not None:
         rows.append(("range error", f"{_range_error(found['error'])} of {found['error']['count']} ranges that count"))
+    if summary.get("smoothed") is not None:
+        rows += [("smoothed", text) for text in _smoothed(summary["smoothed"])]
     shown = found["per_landmark"][:MOST_LANDMARKS]
     rows += [("landmark", _one_landmark(one)) for one in shown]
     if len(found["per_landmark"]) > len(shown):
         rows.append(("landmark", f"{len(found['per_landmark']) - len(shown)} more; --json prints all"))
     return rows
+
+
+def _smoothed(told: Mapping[str, Any]) -> list[str]:
+    """What smoothing gave; only a sentence where it gave nothing."""
+    if not told.get("lives"):
+        return [told["sentence"]]
+    left_out = f", {told['left_out']} left out" if told["left_out"] else ""
+    together = "together" if told["groups"] == 1 else f"in {told['groups']} groups"
+    lives = f"{told['landmarks']} landmarks in {told['lives']} lives {together}{left_out}"
+    texts = [f"{lives}; {told['iterations']} iterations; {told['sentence']}"]
+    if told["error"] is not None:
+        texts.append(f"{_range_error(told['error'])} of {told['error']['count']} ranges that count")
+    if told["same"] is not None:
+        mine, filters = (told["same"][f"{name}_median_percent"] for name in ("smoothed", "filter"))
+        count = told["same"]["count"]
+        texts.append(f"median {mine:.3g} % where the filter has {filters:.3g} %, on the same {count} ranges")
+    return texts
 
 
 def _one_landmark(one: Mapping[str, Any]) -> str:

@@ -38,7 +38,7 @@ def tum_line(t_ns: int, position_m: Sequence[float], quat_xyzw: Sequence[float])
 
 def tum_line_in_plane(t_ns: int, pose: Sequence[float]) -> str:
     """One line of a TUM file of a pose x, y (m), heading (rad)."""
-    x, y, heading = pose
+    x, y, heading = map(float, pose)
     return tum_line(t_ns, (x, y, 0.0), (0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2)))
 
 

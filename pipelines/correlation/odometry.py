@@ -223,7 +223,7 @@ class CorrelationOdometry:
         if not s.recovery:
             return first, 0
         starting = state.velocity is None
-        if _convincing(first) and not (starting and first.alarms & Verdict.PEAK_AT_BORDER):
+        if convincing(first) and not (starting and first.alarms & Verdict.PEAK_AT_BORDER):
             return first, 0
         bases = [(template, predicted)]
         if template.frame != previous.frame:
@@ -231,11 +231,11 @@ class CorrelationOdometry:
         for base, prediction in bases:
             if base is not template:
                 candidate = self._matcher.match(base, grey, prediction, usual_residual=usual)
-                if _convincing(candidate):
+                if convincing(candidate):
                     return candidate, 0
             for motion in self._matcher.search_globally(base.grey, grey, prediction):
                 candidate = self._matcher.match(base, grey, motion, usual_residual=usual)
-                if _convincing(candidate):
+                if convincing(candidate):
                     return candidate, 0 if starting else int(Verdict.REACQUIRED)
         return first, 0
 
@@ -470,7 +470,7 @@ def _motion_time(state: CorrelationState, dt_s: float) -> float:
     return max(dt_s, JITTER * usual_s) if usual_s == usual_s else dt_s
 
 
-def _convincing(candidate: Candidate) -> bool:
+def convincing(candidate: Candidate) -> bool:
     """Whether at least half of the fragments agree; fewer can agree by chance, wherever one looks."""
     return candidate.acceptable and 2 * candidate.inliers >= len(candidate.search)
 

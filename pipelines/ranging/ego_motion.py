@@ -72,7 +72,8 @@ def _series(q, first):  # type: ignore[no-untyped-def]
 
 
 @_jit
-def _arc(omega, velocity, dt):  # type: ignore[no-untyped-def]
+def arc_of(omega, velocity, dt):  # type: ignore[no-untyped-def]
+    """The fields of `Arc`."""
     theta = -omega * dt
     t = _cross(theta)
     tt = t @ t
@@ -95,7 +96,7 @@ def _arc(omega, velocity, dt):  # type: ignore[no-untyped-def]
 
 def arc(omega_radps: Floats, velocity_mps: Floats, dt_s: float) -> Arc:
     """The motion over an interval in which ω [3] and v [3], in camera axes, are constant."""
-    return Arc(*_arc(np.ascontiguousarray(omega_radps), np.ascontiguousarray(velocity_mps), float(dt_s)))
+    return Arc(*arc_of(np.ascontiguousarray(omega_radps), np.ascontiguousarray(velocity_mps), float(dt_s)))
 
 
 @_jit
@@ -103,7 +104,7 @@ def linearise_all(model, mean, turn, shift, reach, turn_by, shift_by, a, g):  # 
     """Predict `mean` [n, 3] in place; fill A = ∂X'/∂X [n, 3, 3] and G = ∂X'/∂(Δω, Δv) [n, 3, 6], camera axes.
 
     The true velocities are the measured ones minus their errors, so G is minus the derivative by the velocities.
-    What comes behind the camera, or quite beside it, is NaN.
+    What comes behind the camera, or quite beside it, is NaN. A ξ below 0, a landmark "beyond infinity", stays one.
     """
     f, cx, cy = model.focal_px, model.centre_x_px, model.centre_y_px
     ray, slope, d = np.ones(3), np.empty((3, 9)), np.empty(3)
@@ -111,7 +112,7 @@ def linearise_all(model, mean, turn, shift, reach, turn_by, shift_by, a, g):  # 
         xi = mean[i, 2]
         ray[0], ray[1] = (mean[i, 0] - cx) / f, (mean[i, 1] - cy) / f
         h = turn @ ray - xi * shift
-        if not (xi > 0.0 and h[2] > BESIDE * np.sqrt(h @ h)):
+        if not h[2] > BESIDE * np.sqrt(h @ h):
             mean[i], a[i], g[i] = np.nan, np.nan, np.nan
             continue
         slope[:, 0], slope[:, 1], slope[:, 2] = turn[:, 0] / f, turn[:, 1] / f, -shift
@@ -133,6 +134,18 @@ def linearise_all(model, mean, turn, shift, reach, turn_by, shift_by, a, g):  # 
                 g[i, :, j - 3] = d
 
 
+@_jit
+def linearise_inputs(model, mean, arc, columns, a, g, all_six):  # type: ignore[no-untyped-def]
+    """`linearise_all` with G by the inputs' errors [n, 3, c], whose `columns` are [6, c]; room for `all_six`."""
+    linearise_all(model, mean, arc[0], arc[1], arc[2], arc[3], arc[4], a, all_six)
+    for i in range(len(mean)):
+        for r in range(3):
+            for c in range(columns.shape[1]):
+                g[i, r, c] = 0.0
+                for j in range(6):
+                    g[i, r, c] += all_six[i, r, j] * columns[j, c]
+
+
 def predicted(model: Model, mean: Floats, motion: Arc) -> tuple[Floats, Floats, Floats]:
     """State ahead [n, 3], A [n, 3, 3] and G [n, 3, 6] of landmarks [n, 3]; NaN for those that came behind."""
     ahead, a, g = mean.copy(), np.empty((len(mean), 3, 3)), np.empty((len(mean), 3, 6))
@@ -145,18 +158,12 @@ def _carry(model, aligned, mean, pairs, dt, omega, velocity, columns, q, turn, s
     n, others, inputs = pairs.shape[0], pairs.shape[1], columns.shape[1]
     half, all_six = np.empty((3, 3)), np.empty((n, 3, 6))
     for k in range(len(dt)):
-        arc = _arc(omega[k], velocity[k], dt[k])
+        arc = arc_of(omega[k], velocity[k], dt[k])
         turn[:], shift[:] = arc[0] @ turn, arc[0] @ shift - arc[1]
         if aligned:
             joint.linearise_all(model, mean, omega[k, 1], velocity[k, 2], dt[k], a, g)
         else:
-            linearise_all(model, mean, arc[0], arc[1], arc[2], arc[3], arc[4], a, all_six)
-            for i in range(n):
-                for r in range(3):
-                    for c in range(inputs):
-                        g[i, r, c] = 0.0
-                        for j in range(6):
-                            g[i, r, c] += all_six[i, r, j] * columns[j, c]
+            linearise_inputs(model, mean, arc, columns, a, g, all_six)
         for i in range(n):
             for at in range(1 if others == 1 else i + 1):
                 j = i if others == 1 else at

@@ -263,30 +263,3 @@ def statuses(update: Update, *, max_relative_sigma: float = 0.1, min_parallax_px
     ):
         found[update.outcome == outcome] = status
     return np.asarray(found, dtype=np.int64)
-
-
-def standstill(
-    speed: Floats, dt: Floats, sigma_speed: float, *, window: int = 10, sigmas: float = 3.0
-) -> NDArray[np.bool_]:
-    """Whether the camera stands in each interval: the mean of Ṽ over the last ones does not differ from 0.
-
-    |mean Ṽ| < n σ_V / √T over the last `window` intervals of total length T; False before there are so many, so
-    that a slow start is no stop.
-
-    Args:
-        speed: Ṽ [..., m], m/s.
-        dt: lengths of the intervals [m], s.
-        sigma_speed: σ_V, m/s/√Hz.
-        window: number of intervals.
-        sigmas: n.
-    """
-    way = np.cumsum(speed * dt, axis=-1)
-    time = np.cumsum(dt)
-    still = np.zeros(speed.shape, dtype=np.bool_)
-    if speed.shape[-1] < window:
-        return still
-    before = np.zeros((*speed.shape[:-1], 1))
-    moved = way[..., window - 1 :] - np.concatenate([before, way[..., :-window]], axis=-1)
-    lasted = time[window - 1 :] - np.concatenate([[0.0], time[:-window]])
-    still[..., window - 1 :] = np.abs(moved) < sigmas * sigma_speed * np.sqrt(lasted)
-    return still

@@ -163,7 +163,7 @@ def linearise_all(model: Model, mean: Floats, omega: float, speed: float, dt: fl
 
 @_jit
 def blocks_ahead(covariance: Floats, a: Floats, g: Floats, q: Floats) -> None:
-    """P_ij ← A_i P_ij A_jᵀ + G_i (Q_c / dt) G_jᵀ for all landmarks, in place; q is the diagonal of Q_c / dt [2]."""
+    """P_ij ← A_i P_ij A_jᵀ + G_i (Q_c / dt) G_jᵀ for all landmarks, in place; q is the diagonal of Q_c / dt [c]."""
     half = np.empty((3, 3))
     for i in range(len(a)):
         for j in range(i + 1):
@@ -174,7 +174,9 @@ def blocks_ahead(covariance: Floats, a: Floats, g: Floats, q: Floats) -> None:
                         half[r, c] += a[i, r, k] * covariance[3 * i + k, 3 * j + c]
             for r in range(3):
                 for c in range(3):
-                    value = g[i, r, 0] * q[0] * g[j, c, 0] + g[i, r, 1] * q[1] * g[j, c, 1]
+                    value = 0.0
+                    for k in range(len(q)):
+                        value += g[i, r, k] * q[k] * g[j, c, k]
                     for k in range(3):
                         value += half[r, k] * a[j, c, k]
                     covariance[3 * i + r, 3 * j + c] = value

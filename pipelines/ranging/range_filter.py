@@ -130,7 +130,7 @@ class Candidate(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RangeState:
-    """All that the estimator carries from sample to sample."""
+    """All that the estimator carries from sample to sample; `ride` is the way to the last frame, for who looks on."""
 
     source: Any
     velocities: Velocities
@@ -140,6 +140,7 @@ class RangeState:
     history: History
     pose: Pose
     sighting: Sighting = NOTHING
+    ride: Ride | None = None
     candidates: tuple[Candidate, ...] = ()
     frames: int = 0
     last_ns: int = -1
@@ -165,7 +166,8 @@ class RangeFilter:
     """Estimates the ranges of landmarks from a moving camera (paper B), each with its uncertainty.
 
     Samples: frames of one stream (images, pixel tracks or bearings, whichever the landmarks come from), odometry, and
-    the IMU's angular velocity where there is one. A frame is judged with the messages that came before it.
+    the IMU's angular velocity where there is one. A frame is judged with the messages that came before it. Its step is
+    of the time at which it was taken: its stamp less `camera_delay_s`.
 
     Args:
         settings: every setting; see `RangeSettings`.
@@ -188,6 +190,7 @@ class RangeFilter:
         self._centre = settings.pinhole_centre_px
         self._noise = noise_of(settings)
         self._body_r_camera = settings.body_r_camera
+        self._delay_ns = round(settings.camera_delay_s / NS)
 
     @property
     def settings(self) -> RangeSettings:
@@ -217,6 +220,7 @@ class RangeFilter:
             unusable = sample.kind in (StreamKind.ODOMETRY, StreamKind.IMU)
             velocities = replace(state.velocities, unusable=state.velocities.unusable or unusable)
             return replace(state, velocities=velocities), None
+        sample = replace(sample, t_ns=sample.t_ns - self._delay_ns)
         if state.frames and sample.stream == state.stream and sample.t_ns <= state.last_ns:
             return self._skip(state, sample)
         source, sighting = self._sighted(state, sample)
@@ -293,6 +297,7 @@ class RangeFilter:
             history=history,
             pose=driven.pose,
             sighting=sighting,
+            ride=ride,
             candidates=self._waiting(state, driven, used, started, everyone, sample.t_ns) if moving else (),
             frames=state.frames + 1,
             last_ns=sample.t_ns,

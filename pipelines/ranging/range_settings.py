@@ -97,6 +97,14 @@ class RangeSettings(FilterSettings, LandmarkSettings):
     synchronisation: Synchronisation = Field(
         Synchronisation.HOLD_BOTH, description="what the speeds are between two messages"
     )
+    latency_buffer_s: NotNegative = Field(
+        0.0,
+        description="the replay takes messages as they arrived, and sorts what comes late by up to this; 0: all are "
+        "sorted beforehand",
+    )
+    camera_delay_s: float = Field(
+        0.0, allow_inf_nan=False, description="the frames' stamps are late by this: a frame is of its stamp less it"
+    )
     gyro: Literal["auto", "imu", "odometry"] = Field("auto", description="whose ω; auto: the IMU's if there is one")
     sigma_omega_across: NotNegative | None = Field(
         None, description="spatial: noise of ω about the robot's x and y, rad/s/√Hz; None: sigma_omega"

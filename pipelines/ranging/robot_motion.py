@@ -69,7 +69,7 @@ class Velocities:
         gyro: angular velocity by the IMU [3], rad/s, its bias in it.
         window: velocities of the last `standstill_s`.
         rest: the rest at the start.
-        disorder: a message came late since the last frame.
+        disorder: since the last frame a message came late: after a later one of its kind, or after its frame.
         unusable: a message could not be used since the last frame.
     """
 
@@ -166,6 +166,7 @@ def with_odometry(s: RangeSettings, known: Velocities, sample: OdometrySample, l
     late = bool(known.speed.t_ns) and sample.t_ns < known.speed.t_ns[-1]
     if late and sample.t_ns <= last_frame_ns:
         return replace(known, disorder=True)
+    disorder = late or sample.t_ns < last_frame_ns
     window = known.window if late else _windowed(s, known.window.having(sample.t_ns, used))
     still = float(s.zero_velocity_update and stands(s, window))
     wheels = known.wheels
@@ -182,7 +183,7 @@ def with_odometry(s: RangeSettings, known: Velocities, sample: OdometrySample, l
         wheels=wheels,
         window=window,
         rest=rest,
-        disorder=known.disorder or late,
+        disorder=known.disorder or disorder,
     )
 
 
@@ -195,7 +196,7 @@ def with_imu(s: RangeSettings, known: Velocities, sample: ImuSample, last_frame_
     if late and sample.t_ns <= last_frame_ns:
         return replace(known, disorder=True)
     gyro = _kept(known.gyro.having(sample.t_ns, tuple(omega.tolist())), last_frame_ns)
-    return replace(known, gyro=gyro, disorder=known.disorder or late)
+    return replace(known, gyro=gyro, disorder=known.disorder or late or sample.t_ns < last_frame_ns)
 
 
 def _kept(signal: Signal, last_frame_ns: int) -> Signal:
@@ -222,15 +223,13 @@ def stands(s: RangeSettings, window: Signal) -> bool:
     """
     if not _lasts(s, window):
         return False
-    limit = (s.standstill_sigmas * s.sigma_speed) ** 2 * NS
-    t_ns, x, y, z = window.t_ns, 0.0, 0.0, 0.0
-    for k in range(len(t_ns) - 1, 0, -1):
-        dt = (t_ns[k] - t_ns[k - 1]) * NS
-        vx, vy, vz = window.values[k]
-        x, y, z = x + vx * dt, y + vy * dt, z + vz * dt
-        if x * x + y * y + z * z > limit * (t_ns[-1] - t_ns[k - 1]):
-            return False
-    return math.hypot(x, y, z) <= s.standstill_limit_mps * (t_ns[-1] - t_ns[0]) * NS
+    t_ns = np.array(window.t_ns)
+    back = np.diff(t_ns)[::-1, None] * NS * np.array(window.values[:0:-1])
+    way_m = np.linalg.norm(np.cumsum(back, axis=0), axis=1)
+    noise_m = s.standstill_sigmas * s.sigma_speed * np.sqrt((t_ns[-1] - t_ns[-2::-1]) * NS)
+    if (way_m > noise_m).any():
+        return False
+    return bool(way_m[-1] <= s.standstill_limit_mps * (t_ns[-1] - t_ns[0]) * NS)
 
 
 # ----------------------------------------------------------------------------- a frame

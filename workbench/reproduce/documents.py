@@ -35,6 +35,14 @@ def made_folder(folder: Path) -> Path:
     return folder
 
 
+def write_report(lines: Iterable[str], folder: Path) -> Path:
+    """Write report.md, whose lines may draw their pictures as they come; returns it."""
+    (folder / "pictures").mkdir(exist_ok=True)
+    report = folder / "report.md"
+    report.write_text("\n".join(lines) + "\n", encoding="utf-8")
+    return report
+
+
 def write_json(values: Mapping[str, Any], file: Path) -> None:
     """Values as JSON, null for every number that is not finite."""
     file.write_text(json.dumps(without_nan(values), indent=1, allow_nan=False) + "\n", encoding="utf-8")

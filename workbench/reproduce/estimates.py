@@ -16,6 +16,7 @@ from pipelines.correlation.odometry import CorrelationOdometry
 from pipelines.correlation.settings import Correction, CorrelationSettings
 from pipelines.correlation.step import CorrelationStep
 from pipelines.correlation.trajectory import Pose, Segment, corrected, integrated
+from pipelines.estimator import Step
 from pipelines.geometry import Floats
 from pipelines.replay import grey_sample
 from readers.streams import Camera, ImageSample, Recording, Sample, StreamInfo, StreamKind
@@ -55,8 +56,9 @@ class Notes:
     def __init__(self) -> None:
         self._rows: list[tuple[float, ...]] = []
 
-    def add(self, step: CorrelationStep) -> None:
+    def add(self, step: Step) -> None:
         """Take note of the step of one frame."""
+        assert isinstance(step, CorrelationStep)
         self._rows.append((*step.frame_shift_px, step.delta_heading_rad, *step.pose))
 
     def estimate(self) -> Estimate:

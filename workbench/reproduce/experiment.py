@@ -9,17 +9,15 @@ import zipfile
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from pipelines.correlation.settings import CorrelationSettings
-from pipelines.correlation.step import CorrelationStep
-from pipelines.estimator import Step
 from pipelines.geometry import Floats
 from workbench import session
 from workbench.reproduce import estimates as est
 from workbench.reproduce.conditions import METRES_PER_PX, NOISE_GREY, RATE_HZ, Condition, experiment_drive, motion_of
+from workbench.reproduce.logged import logged
 from workbench.reproduce.measures import Accuracy, accuracy
 from workbench.reproduce.tasks import Tick
 from workbench.settings import settings_values
@@ -155,26 +153,8 @@ def _logged(frames: est.RenderedOnce, cell: Cell, preset: str, folder: Path, tic
         path=frames.path, preset=preset, overrides=overrides, height="none", out=log_folder(cell, folder)
     )
     notes = est.Notes()
-    sensors, run = session.rerun_writers()
-    writers = session.Writers(sensors, lambda *args, **options: _Noted(run(*args, **options), notes))
-    outcome = session.run(request, recording=frames.lent(), on_progress=lambda _: tick(), writers=writers)
-    if outcome.summary["interrupted"]:
-        raise KeyboardInterrupt
+    logged(request, notes.add, recording=frames.lent(), tick=tick)
     return notes.estimate()
-
-
-class _Noted:
-    """A log of a run, of whose steps notes are taken."""
-
-    def __init__(self, log: session.RunLog, notes: est.Notes) -> None:
-        self._log, self._notes = log, notes
-        self.event, self.errors, self.finish, self.close = log.event, log.errors, log.finish, log.close
-
-    def step(self, step: Step, beside: Any = None) -> None:
-        """Note and log a step."""
-        assert isinstance(step, CorrelationStep)
-        self._notes.add(step)
-        self._log.step(step, beside)
 
 
 def _file(cell: Cell, folder: Path) -> Path:

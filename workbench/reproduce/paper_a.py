@@ -13,11 +13,9 @@ from workbench.reproduce import correction, experiment, limits, matrix, report
 from workbench.reproduce.conditions import CONDITIONS, FRAMES, surface_of
 from workbench.reproduce.documents import made_folder
 from workbench.reproduce.ledger import Ledger, Part
+from workbench.reproduce.plans import OnProgress, Reproduced, at_least
 from workbench.reproduce.tasks import carried_out
-from workbench.settings import SettingsError
 
-OnProgress = Callable[[str, int, int], None]
-"""Told what is being done, how many steps of it are done, and how many there are."""
 LOGGED = ("C0", "C4")
 FEWEST_FRAMES = 60
 
@@ -30,7 +28,7 @@ class Plan:
     `overrides` are ``key=value`` over the preset paper-a; `samples` are the fragments of a cell of the limits.
     """
 
-    out: Path = Path("results/paper-a")
+    out: Path
     surface: str | None = None
     frames: int = FRAMES
     seeds: int = 1
@@ -64,16 +62,6 @@ class Plan:
         return sorted(cells, key=lambda cell: not is_logged(cell))
 
 
-@dataclass(frozen=True, slots=True)
-class Reproduced:
-    """What came of it: the folder, the report, the results, and whether it was interrupted."""
-
-    folder: Path
-    file: Path
-    results: report.Results
-    interrupted: bool
-
-
 def is_logged(cell: experiment.Cell) -> bool:
     """Whether the runs of a drive are logged as .rrd."""
     return cell.seed == 0 and cell.condition.name in LOGGED
@@ -86,7 +74,7 @@ def _kept(cell: experiment.Cell, folder: Path) -> experiment.Run | None:
     return experiment.kept(cell, folder)
 
 
-def reproduce(plan: Plan, on_progress: OnProgress) -> Reproduced:
+def reproduce(plan: Plan, on_progress: OnProgress) -> Reproduced[report.Results]:
     """Do what is missing of the plan in its folder, and write the report.
 
     Finished parts are found again, so that the same call goes on after an interrupt.
@@ -106,13 +94,10 @@ def reproduce(plan: Plan, on_progress: OnProgress) -> Reproduced:
 
 
 def _check(plan: Plan) -> None:
-    for name, value, least in (
-        ("frames", plan.frames, FEWEST_FRAMES),
-        ("seeds", plan.seeds, 1),
-        ("jobs", plan.jobs, 1),
-    ):
-        if value is not None and value < least:
-            raise SettingsError(f"--{name} {value}: must be {least} or more")
+    at_least("frames", plan.frames, FEWEST_FRAMES)
+    at_least("seeds", plan.seeds, 1)
+    if plan.jobs is not None:
+        at_least("jobs", plan.jobs, 1)
     if plan.surface is not None and plan.surface not in FAMILIES:
         surface_of(plan.surface, 0)
     plan.cells[0].identity  # noqa: B018 (the settings are checked before anything is computed)

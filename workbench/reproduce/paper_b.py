@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -11,17 +10,14 @@ from typing import Any
 
 from workbench import scenarios
 from workbench.reproduce.documents import made_folder
-from workbench.reproduce.ranging import report
-from workbench.reproduce.ranging import robot as replica
+from workbench.reproduce.plans import OnProgress, Reproduced, at_least
+from workbench.reproduce.ranging import replica, report, robot
 from workbench.reproduce.ranging import simulation as sim
 from workbench.reproduce.ranging.parts import Part
 from workbench.reproduce.ranging.results import Results
 from workbench.reproduce.tasks import Task, carried_out
 from workbench.session import versions
-from workbench.settings import SettingsError
 
-OnProgress = Callable[[str, int, int], None]
-"""Told what is being done, how many steps of it are done, and how many there are."""
 RUNS, SEEDS = 4000, 40
 FEWEST_RUNS, FEWEST_SEEDS = 10, 1
 
@@ -30,31 +26,22 @@ FEWEST_RUNS, FEWEST_SEEDS = 10, 1
 class Plan:
     """What is to be done: `runs` of each Monte Carlo, `seeds` runs of the robot."""
 
-    out: Path = Path("results/paper-b")
+    out: Path
     runs: int = RUNS
     seeds: int = SEEDS
     command: str = "workbench reproduce paper-b"
 
 
 @dataclass(frozen=True, slots=True)
-class Reproduced:
-    """What came of it: the folder, the report, the results, and whether it was interrupted."""
-
-    folder: Path
-    file: Path
-    results: Results
-    interrupted: bool
-
-
-@dataclass(frozen=True, slots=True)
 class Work:
-    """One part: what it is called, what makes it, how many ticks that takes, and what it depends on."""
+    """One part: what it is called, what makes it, how many ticks that takes, what it depends on, its files."""
 
     name: str
     kind: type[Part]
     make: Task[Part]
     ticks: int
     depends: dict[str, Any]
+    files: tuple[Path, ...] = ()
 
 
 def works(plan: Plan) -> list[Work]:
@@ -72,13 +59,13 @@ def works(plan: Plan) -> list[Work]:
         )
     ]
     scenario = scenarios.load(replica.SCENARIO).scenario.model_dump(mode="json")
-    ticks = plan.seeds + min(plan.seeds, replica.WAYS_RUNS) + 2
-    depends = {"runs": plan.runs, "seeds": plan.seeds, "scenario": scenario}
-    made.append(Work("robot", replica.Robot, partial(replica.robot, plan.seeds, plan.runs), ticks, depends))
+    depends = {"runs": plan.runs, "seeds": plan.seeds, "scenario": scenario, "ways": robot.WAYS}
+    make = partial(robot.robot, plan.seeds, plan.runs, plan.out)
+    made.append(Work("robot", robot.Robot, make, robot.ticks(plan.seeds), depends, robot.log_files(plan.out)))
     return made
 
 
-def reproduce(plan: Plan, on_progress: OnProgress) -> Reproduced:
+def reproduce(plan: Plan, on_progress: OnProgress) -> Reproduced[Results]:
     """Do what is missing of the plan in its folder, and write the report.
 
     Finished parts are found again, so that the same call goes on after an interrupt.
@@ -86,9 +73,8 @@ def reproduce(plan: Plan, on_progress: OnProgress) -> Reproduced:
     Raises:
         WorkbenchError: the plan cannot be carried out; the text says why.
     """
-    for name, value, least in (("runs", plan.runs, FEWEST_RUNS), ("seeds", plan.seeds, FEWEST_SEEDS)):
-        if value < least:
-            raise SettingsError(f"--{name} {value}: must be {least} or more")
+    at_least("runs", plan.runs, FEWEST_RUNS)
+    at_least("seeds", plan.seeds, FEWEST_SEEDS)
     made_folder(plan.out)
     wanted, found, interrupted = works(plan), dict[str, Part](), False
     try:
@@ -98,6 +84,7 @@ def reproduce(plan: Plan, on_progress: OnProgress) -> Reproduced:
         interrupted = True
     results = Results(
         command=plan.command,
+        log=robot.log_folder(plan.out),
         runs=plan.runs,
         seeds=plan.seeds,
         unfinished=[work.name for work in wanted if work.name not in found],
@@ -110,7 +97,7 @@ def _done(work: Work, folder: Path, on_progress: OnProgress) -> Part:
     """The part, from the folder or made now."""
     identity = json.dumps({"versions": versions(), **work.depends}, sort_keys=True, default=str)
     kept = work.kind.kept(folder, identity)
-    if kept is not None:
+    if kept is not None and all(file.is_file() for file in work.files):
         return kept
     (part,) = carried_out([work.make], jobs=1, on_tick=lambda done: on_progress(work.name, done, work.ticks))
     part.keep(folder, identity)

@@ -30,6 +30,7 @@ from workbench.reproduce.documents import (
     version_lines,
     write_csv,
     write_json,
+    write_report,
 )
 from workbench.reproduce.experiment import METHODS, Run
 from workbench.reproduce.judged import Statement
@@ -196,12 +197,9 @@ VARIED = (
 
 def write(results: Results, folder: Path) -> Path:
     """Write report.md, its pictures, report.json and the CSV files; returns the report."""
-    (folder / "pictures").mkdir(exist_ok=True)
     write_json(values(results), folder / "report.json")
     write_csv([_run_values(run, method) for run in results.runs for method in METHODS], folder / "experiment.csv")
-    report = folder / "report.md"
-    report.write_text("\n".join(_lines(results, folder)) + "\n", encoding="utf-8")
-    return report
+    return write_report(_lines(results, folder), folder)
 
 
 def values(results: Results) -> dict[str, Any]:

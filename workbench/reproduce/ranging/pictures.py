@@ -122,15 +122,15 @@ def consistency(found: Consistency) -> Figure:
 
 
 def speeds(found: Robot) -> Figure:
-    """As Fig. 10: measured speeds of the camera."""
+    """As Fig. 10: measured speeds of the camera, as the filter used them."""
     figure, axes = figure_of(9.0, 4.4, 2, 1, sharex=True)
     linear, angular = axes[:, 0]
-    linear.plot(found.run.speed_s, found.run.speed, color=BLUE, lw=0.8)
+    linear.plot(found.run.frame_s, found.run.speed, color=BLUE, lw=0.8)
     linear.set_ylabel("speed V, m/s")
-    angular.plot(found.run.omega_s, np.degrees(found.run.omega), color=RED, lw=0.5)
+    angular.plot(found.run.frame_s, np.degrees(found.run.omega), color=RED, lw=0.8)
     angular.set_ylabel("turn ω, °/s")
     angular.set_xlabel("time, s")
-    figure.suptitle("as Fig. 10: measured linear and angular speed of the camera")
+    figure.suptitle("as Fig. 10: measured linear and angular speed of the camera, means from frame to frame")
     return figure
 
 

@@ -19,10 +19,12 @@ from workbench.reproduce.documents import (
     version_lines,
     write_csv,
     write_json,
+    write_report,
 )
 from workbench.reproduce.ranging import pictures
+from workbench.reproduce.ranging.replica import START_FACTOR
 from workbench.reproduce.ranging.results import Results
-from workbench.reproduce.ranging.robot import BAND, START_FACTOR, TABLE_3, Robot
+from workbench.reproduce.ranging.robot import BAND, LOGGED, TABLE_3, WAYS, Robot
 from workbench.reproduce.ranging.simulation import (
     Accuracy,
     Asynchronous,
@@ -223,14 +225,11 @@ def tables(results: Results) -> dict[str, Table]:
 
 def write(results: Results, folder: Path) -> Path:
     """Write report.md, its pictures, values.json and the CSV files; returns the report."""
-    (folder / "pictures").mkdir(exist_ok=True)
     write_json(values(results), folder / "values.json")
     for name, (heads, rows) in tables(results).items():
         file = name.lower().replace(",", "").replace(":", "").replace(" ", "-")
         write_csv([dict(zip(_distinct(heads), row, strict=True)) for row in rows], folder / f"{file}.csv")
-    report = folder / "report.md"
-    report.write_text("\n".join(_lines(results, folder)) + "\n", encoding="utf-8")
-    return report
+    return write_report(_lines(results, folder), folder)
 
 
 def _distinct(heads: Any) -> list[str]:
@@ -277,6 +276,7 @@ def _lines(results: Results, folder: Path) -> Iterator[str]:
     yield from _simulation(results, made, folder)
     if results.robot:
         yield from _robot(results.robot, made, folder)
+        yield from ("", _log(results.log.name))
     yield from version_lines()
 
 
@@ -347,3 +347,9 @@ def _robot(found: Robot, made: Mapping[str, Table], folder: Path) -> Iterator[st
     for name, draw in (("fig10", pictures.speeds), ("fig11", pictures.depth), ("fig12", pictures.errors)):
         yield from picture(folder, name, partial(draw, found))
     yield from ("", "Whole runs, fed in several ways; medians:", "", *markdown(made["ways to feed the filter"]))
+
+
+def _log(name: str) -> str:
+    """Where the runs lie that the viewer shows."""
+    runs = " and ".join(f"`{WAYS[way].preset}` ({way})" for way in LOGGED)
+    return f"Figs 10-12 are those of seed 0, whose log lies in the folder `{name}` for `workbench view`: {runs}."

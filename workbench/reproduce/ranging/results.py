@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from pathlib import Path
 
 from workbench.reproduce.ranging.parts import Part
 from workbench.reproduce.ranging.robot import Robot
@@ -20,9 +21,13 @@ from workbench.reproduce.ranging.simulation import (
 
 @dataclass(frozen=True, kw_only=True)
 class Results:
-    """The parts; None for one that was not done. `runs` of each Monte Carlo, `seeds` runs of the replica."""
+    """The parts; None for one that was not done.
+
+    `runs` of each Monte Carlo, `seeds` runs of the replica; `log` is the folder of the one that is logged.
+    """
 
     command: str
+    log: Path
     runs: int
     seeds: int
     accuracy: Accuracy | None = None
