@@ -28,7 +28,7 @@ ODD_Z = 4.0
 """A number this many standard deviations off is out of its usual range: 1 of 16 000 of a normal distribution."""
 SAMPLED = 1500
 """Frames that the medians are taken of, evenly spread over the run."""
-DRIFTS = 0.05
+DRIFTS = 0.2
 """A number drifts if its median change from frame to frame is below this share of its deviation."""
 NOT_JUDGED = ("frame", "t_ns", "received_ns", "verdict", "alarms")
 
@@ -195,9 +195,9 @@ def _judged(run: Run, name: str, column: NDArray[Any], row: int) -> Quantity:
     about = quantities(run.step_type)[name]
     flat = column.reshape(len(column), -1)
     here = flat[row].astype(float)
-    found = _Scores.none(len(here))
+    found = Scores.none(len(here))
     if name not in NOT_JUDGED and len(flat) > 1 and len(here):
-        found = _scores(flat.astype(float, copy=False), row)
+        found = scores(flat.astype(float, copy=False), row)
     at = _most_unusual(found.z, here) if len(here) else None
     index = np.unravel_index(at, column.shape[1:]) if at is not None and column.ndim > 1 else ()
     return Quantity(
@@ -223,7 +223,7 @@ def _most_unusual(z: Floats, values: Floats) -> int:
     return int(finite[0]) if len(finite) else 0
 
 
-class _Scores(NamedTuple):
+class Scores(NamedTuple):
     """Of each number [k] of a field at a frame: z-score, usual value, change, whether it drifts.
 
     `rarity` and `stands_out` are about the furthest of them, see `Quantity`.
@@ -237,13 +237,13 @@ class _Scores(NamedTuple):
     stands_out: float
 
     @classmethod
-    def none(cls, count: int) -> _Scores:
+    def none(cls, count: int) -> Scores:
         """Of a field that is not judged."""
         nothing = np.full(count, np.nan)
         return cls(nothing, nothing, nothing, np.zeros(count, bool), math.nan, math.nan)
 
 
-def _scores(column: Floats, row: int) -> _Scores:
+def scores(column: Floats, row: int) -> Scores:
     """Judge a row of a field's numbers [n, k] by a sample of the others."""
     rows = np.unique(np.linspace(1, len(column) - 1, SAMPLED).astype(int))
     sample, step = column[rows], column[rows] - column[rows - 1]
@@ -258,7 +258,7 @@ def _scores(column: Floats, row: int) -> _Scores:
     furthest = np.nanmax(np.nan_to_num(others, posinf=np.inf), axis=1, keepdims=True)
     here = np.array([np.nanmax(np.abs(z)) if not np.isnan(z).all() else 0.0])
     stands_out = _z(here, *_spread(furthest))[0]
-    return _Scores(z, usual, change, drifts, float(np.mean(furthest >= here)), float(stands_out))
+    return Scores(z, usual, change, drifts, float(np.mean(furthest >= here)), float(stands_out))
 
 
 def _z(value: Floats, middle: Floats, spread: Floats) -> Floats:
