@@ -35,7 +35,7 @@ from pipelines.estimator import Step
 from pipelines.geometry import heading_of_quat
 from pipelines.ranging.step import RangeStep
 from pipelines.verdict import Severity, Verdict
-from readers.streams import ImageError, ImageSample, PoseSample, RecordingError
+from readers.streams import ImageError, ImageSample, PoseSample, RecordingError, Sample
 from workbench import traces
 from workbench.blueprints import Bounds, Extent, blueprint_of, sensor_blueprint
 from workbench.rrd_correlation import CorrelationDrawing
@@ -55,6 +55,7 @@ from workbench.rrd_file import (
     texts,
 )
 from workbench.rrd_ranges import RangeDrawing
+from workbench.rrd_samples import SampleLog, is_grey
 from workbench.schema import Archetype, Row, Schema, schema_of
 
 if TYPE_CHECKING:
@@ -62,6 +63,7 @@ if TYPE_CHECKING:
 
 MAX_ROWS = 1024
 MAX_BYTES = 2 << 20
+MAX_SAMPLES = 8192
 MAX_AGE_S = 0.5
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -142,6 +144,7 @@ class SensorWriter(_Writer):
         self._pixels: list[tuple[int, int, NDArray[Any]]] = []
         self._frames: list[tuple[int, int]] = []
         self._bytes = 0
+        self._samples = SampleLog(self._file)
         self._reference: tuple[Ints, Floats, Floats] | None = None
         self._arrow_m = 1.0
 
@@ -154,7 +157,7 @@ class SensorWriter(_Writer):
         if sample.media_type is not None:
             self._encoded(frame, sample.t_ns, sample.data, sample.media_type)
         else:
-            pixels = sample.grey() if _is_grey(sample.encoding) else sample.colour()
+            pixels = sample.grey() if is_grey(sample.encoding) else sample.colour()
             if self._raw_images == "raw":
                 self._pixels.append((frame, sample.t_ns, pixels))
                 self._bytes += pixels.nbytes
@@ -162,6 +165,11 @@ class SensorWriter(_Writer):
                 self._encoded(frame, sample.t_ns, _png(pixels, sample), "image/png")
         self._frames.append((frame, sample.t_ns))
         self._flush_if(self._bytes > MAX_BYTES or len(self._frames) >= MAX_ROWS)
+
+    def sample(self, original: Sample, decoded: Sample) -> None:
+        """Log the next sample in the order of arrival, as it was stored and as the estimator got it."""
+        self._samples.add(original, decoded)
+        self._flush_if(self._samples.bytes > MAX_BYTES or len(self._samples) >= MAX_SAMPLES)
 
     def undecodable(self, frame: int, t_ns: int, reason: str) -> None:
         """Log that a frame has no image, and why; the viewer then shows none."""
@@ -202,6 +210,7 @@ class SensorWriter(_Writer):
         self._bytes += len(data)
 
     def _write(self) -> None:
+        self._samples.write()
         if self._images:
             frames, t_ns, data, media = zip(*self._images, strict=True)
             columns = rr.EncodedImage.columns(blob=blobs(data), media_type=list(media))
@@ -225,10 +234,6 @@ class SensorWriter(_Writer):
         good = np.isfinite(vectors).all(axis=1)
         arrows = rr.Arrows3D.columns(vectors=vectors[good], origins=points[good])
         self._file.send(f"{REFERENCE}/heading", frames[good], t_ns[good], arrows)
-
-
-def _is_grey(encoding: str) -> bool:
-    return encoding.lower().startswith(("mono", "8uc1", "16uc1"))
 
 
 def _png(pixels: NDArray[Any], sample: ImageSample) -> bytes:

@@ -1,0 +1,286 @@
+"""The samples that an estimator got, in ``sensors.rrd``: written as columns, read back as the readers' objects.
+
+Each stream has the entity ``/sensors/streams/STREAM``. What every sample has stands in the components ``Sample:…``:
+its class, its place `order` in the order in which all streams came, `received_ns`, the number of a frame. Numbers that
+make a plot are `Scalars`; tracks and landmarks keep theirs in ``Sample:values``. An image's pixels stand at
+``/camera/image``; only where that picture does not give back the very grey levels that the estimator got they stand
+here once more, as PNG.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Iterable, Sequence
+from typing import Any, NamedTuple
+
+import cv2
+import numpy as np
+import pyarrow as pa
+import rerun as rr
+from numpy.typing import NDArray
+
+from readers.streams import (
+    ImageError,
+    ImageSample,
+    ImuSample,
+    LandmarkSample,
+    OdometrySample,
+    PoseSample,
+    Problem,
+    RangeSample,
+    Sample,
+    ScalarSample,
+    StreamKind,
+    TrackSample,
+)
+from workbench.rrd_file import RrdFile, blobs
+
+ROOT = "/sensors/streams"
+ARCHETYPE = "Sample"
+_SCALARS = "Scalars:scalars"
+
+
+class Form(NamedTuple):
+    """How the samples of a class stand in columns.
+
+    `numbers` are the float fields with their shapes, -1 for one that a sample decides; `texts` the fields of text;
+    `plotted`: the numbers have the same meaning in every sample, and make a plot.
+    """
+
+    kind: type[Sample]
+    numbers: tuple[tuple[str, tuple[int, ...]], ...] = ()
+    texts: tuple[str, ...] = ()
+    plotted: bool = True
+
+
+FORMS = {
+    form.kind.__name__: form
+    for form in (
+        Form(ImageSample),
+        Form(Problem, texts=("kind", "reason")),
+        Form(ScalarSample, (("value", ()),)),
+        Form(
+            RangeSample,
+            (("range_m", ()), ("min_range_m", ()), ("max_range_m", ()), ("field_of_view_rad", ())),
+        ),
+        Form(
+            PoseSample,
+            (("position_m", (3,)), ("quat_xyzw", (4,)), ("covariance", (6, 6))),
+            ("parent_frame", "child_frame"),
+        ),
+        Form(
+            ImuSample,
+            (("angular_velocity_radps", (3,)), ("linear_acceleration_mps2", (3,)), ("quat_xyzw", (4,))),
+        ),
+        Form(
+            OdometrySample,
+            (
+                ("linear_velocity_mps", (3,)),
+                ("angular_velocity_radps", (3,)),
+                ("position_m", (3,)),
+                ("quat_xyzw", (4,)),
+            ),
+        ),
+        Form(TrackSample, (("points_px", (-1, 2)),), plotted=False),
+        Form(LandmarkSample, (("range_m", (-1,)), ("bearing_rad", (-1,))), plotted=False),
+    )
+}
+
+
+def entity_of(stream: str) -> str:
+    """Where the samples of a stream stand."""
+    return "/".join([ROOT, *(rr.escape_entity_path_part(part) for part in stream.split("/") if part)])
+
+
+class Row(NamedTuple):
+    """A sample as it was told to the log, its place in the order of arrival, and its grey levels as PNG if needed."""
+
+    order: int
+    sample: Sample
+    grey: bytes
+
+
+# ---------------------------------------------------------------------------------- writing
+
+
+class SampleLog:
+    """Buffers samples and sends them as columns."""
+
+    def __init__(self, file: RrdFile) -> None:
+        self._file = file
+        self._rows: list[Row] = []
+        self._named: set[str] = set()
+        self._count = 0
+        self.bytes = 0
+
+    def __len__(self) -> int:
+        return len(self._rows)
+
+    def add(self, original: Sample, decoded: Sample) -> None:
+        """Take the next sample in the order of arrival, as it was stored and as the estimator got it.
+
+        Samples of classes that no estimator takes count, and are not kept.
+        """
+        kept = decoded if isinstance(decoded, Problem) else original
+        order, self._count = self._count, self._count + 1
+        if type(kept).__name__ in FORMS:
+            grey = _grey(original, decoded)
+            self._rows.append(Row(order, kept, grey))
+            self.bytes += len(grey)
+
+    def write(self) -> None:
+        """Send what is buffered."""
+        rows, self._rows, self.bytes = self._rows, [], 0
+        groups: dict[tuple[str, str, bool], list[Row]] = {}
+        for row in rows:
+            groups.setdefault((row.sample.stream, type(row.sample).__name__, bool(row.grey)), []).append(row)
+        for (stream, kind, _), group in groups.items():
+            self._send(entity_of(stream), FORMS[kind], group)
+
+    def _send(self, entity: str, form: Form, rows: Sequence[Row]) -> None:
+        samples = [row.sample for row in rows]
+        numbers = [_numbers(form, sample) for sample in samples]
+        components: dict[str, Any] = {
+            "order": [row.order for row in rows],
+            "received_ns": [sample.received_ns for sample in samples],
+            "class": [form.kind.__name__] * len(rows),
+        }
+        lists: dict[str, list[Any]] = {
+            "texts": [[*(str(getattr(s, name)) for name in form.texts), *s.oddities] for s in samples]
+        }
+        if hasattr(samples[0], "ids"):
+            lists["ids"] = [s.ids for s in samples]  # type: ignore[attr-defined]
+        columns: list[Any] = []
+        if form.numbers and form.plotted:
+            self._legend(entity, form)
+            columns += rr.Scalars.columns(scalars=np.concatenate(numbers)).partition([len(n) for n in numbers])
+        elif form.numbers:
+            lists["values"] = numbers
+        if rows[0].grey:
+            components["grey"] = blobs([row.grey for row in rows])
+        columns += rr.DynamicArchetype.columns(ARCHETYPE, components=components)
+        for name, values in lists.items():
+            flat: Any = list(itertools.chain(*values)) if name == "texts" else np.concatenate(values)
+            if not len(flat):
+                continue
+            column = rr.DynamicArchetype.columns(ARCHETYPE, components={name: flat})
+            columns += column.partition([len(v) for v in values])
+        # not on the timeline of frames: its numbers are those of the frames of one stream
+        t_ns = np.array([sample.t_ns for sample in samples], np.int64)
+        frames = [getattr(sample, "frame", -1) for sample in samples]
+        on_frames = all(frame >= 0 for frame in frames)
+        self._file.send(entity, np.array(frames, np.int64) if on_frames else None, t_ns, columns)
+
+    def _legend(self, entity: str, form: Form) -> None:
+        if entity not in self._named:
+            self._named.add(entity)
+            self._file.static(entity, rr.SeriesLines(names=list(_names(form))))
+
+
+def _numbers(form: Form, sample: Sample) -> NDArray[np.float64]:
+    parts = [np.asarray(getattr(sample, name), np.float64).ravel() for name, _ in form.numbers]
+    return np.concatenate(parts) if parts else np.empty(0)
+
+
+def _names(form: Form) -> Iterable[str]:
+    for name, shape in form.numbers:
+        for index in np.ndindex(*shape):
+            yield f"{name}[{','.join(map(str, index))}]" if index else name
+
+
+def _grey(original: Sample, decoded: Sample) -> bytes:
+    """The grey levels as PNG, where the picture in the log would not give back the same."""
+    if not (isinstance(original, ImageSample) and isinstance(decoded, ImageSample)):
+        return b""
+    if original is decoded or original.media_type is not None or is_grey(original.encoding):
+        return b""
+    good, data = cv2.imencode(".png", decoded.grey(), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+    if not good:
+        raise ImageError(f"{original.source or original.stream}: the grey levels cannot be encoded as PNG")
+    return bytes(data)
+
+
+def is_grey(encoding: str) -> bool:
+    """Whether a raw encoding is grey levels as they are."""
+    return encoding.lower().startswith(("mono", "8uc1", "16uc1"))
+
+
+# ---------------------------------------------------------------------------------- reading
+
+
+@dataclasses.dataclass(slots=True)
+class Stored:
+    """A sample of the log: its place in the order of arrival, and the sample; an image without its payload."""
+
+    order: int
+    sample: Sample
+    grey: bytes | None = None
+
+
+def samples_of(stream: str, batches: Iterable[pa.RecordBatch]) -> list[Stored]:
+    """The samples of a stream out of the rows of its entity, in the order of arrival."""
+    found = [stored for batch in batches for stored in _of_batch(stream, batch)]
+    return sorted(found, key=lambda stored: stored.order)
+
+
+def _of_batch(stream: str, batch: pa.RecordBatch) -> Iterable[Stored]:
+    names = batch.schema.names
+    if f"{ARCHETYPE}:class" not in names:
+        return
+
+    def column(name: str) -> list[Any]:
+        return batch.column(name).to_pylist() if name in names else [None] * batch.num_rows
+
+    t_ns = batch.column("sensor_time").cast(pa.int64()).to_pylist()
+    orders, received, kinds = (column(f"{ARCHETYPE}:{name}") for name in ("order", "received_ns", "class"))
+    numbers = _arrays(batch, f"{ARCHETYPE}:values" if f"{ARCHETYPE}:values" in names else _SCALARS, np.float64)
+    ids = _arrays(batch, f"{ARCHETYPE}:ids", np.int64)
+    texts, greys, frames = column(f"{ARCHETYPE}:texts"), column(f"{ARCHETYPE}:grey"), column("frame")
+    for i in range(batch.num_rows):
+        form = FORMS[kinds[i][0]]
+        words = texts[i] or []
+        fields: dict[str, Any] = dict(zip(form.texts, words[: len(form.texts)], strict=True))
+        fields |= _split(form, numbers[i], len(ids[i]))
+        common = {"stream": stream, "t_ns": t_ns[i], "received_ns": received[i][0]}
+        common["oddities"] = tuple(words[len(form.texts) :])
+        if form.kind in (TrackSample, LandmarkSample):
+            fields["ids"] = ids[i]
+        if form.kind in (TrackSample, LandmarkSample, ImageSample, Problem):
+            fields["frame"] = -1 if frames[i] is None else frames[i]
+        if form.kind is Problem:
+            fields["kind"] = StreamKind(fields["kind"])
+        if form.kind is ImageSample:
+            fields |= {"encoding": "", "payload": b""}
+        yield Stored(orders[i][0], form.kind(**common, **fields), None if greys[i] is None else _blob(greys[i]))
+
+
+def _blob(value: Any) -> bytes:
+    return bytes(value[0])
+
+
+def _arrays(batch: pa.RecordBatch, name: str, kind: Any) -> list[NDArray[Any]]:
+    """The rows of a column of lists of numbers."""
+    if name not in batch.schema.names:
+        return [np.empty(0, kind)] * batch.num_rows
+    column = batch.column(name)
+    lengths = [n or 0 for n in column.value_lengths().to_pylist()]
+    flat = column.flatten().to_numpy(zero_copy_only=False).astype(kind, copy=False)
+    bounds = np.cumsum([0, *lengths])
+    return [flat[a:b] for a, b in itertools.pairwise(bounds)]
+
+
+def _split(form: Form, numbers: NDArray[np.float64], count: int) -> dict[str, Any]:
+    """The numbers of a sample as its fields; -1 in a shape stands for `count`."""
+    fields: dict[str, Any] = {}
+    start = 0
+    for name, shape in form.numbers:
+        actual = tuple(count if n < 0 else n for n in shape)
+        part = numbers[start : start + math.prod(actual)]
+        start += math.prod(actual)
+        if shape:
+            fields[name] = np.ascontiguousarray(part.reshape(actual))
+        else:
+            fields[name] = float(part[0])
+    return fields
