@@ -3,16 +3,15 @@
 Each stream has the entity ``/sensors/streams/STREAM``. What every sample has stands in the components ``Sample:…``:
 its class, its place `order` in the order in which all streams came, `received_ns`, the number of a frame. Numbers that
 make a plot are `Scalars`; tracks and landmarks keep theirs in ``Sample:values``. An image's pixels stand at
-``/camera/image``; only where that picture does not give back the very grey levels that the estimator got they stand
-here once more, as PNG.
+``/camera/image``; only where that picture does not give back the very grey levels that the estimator got, these stand
+at ``/sensors/grey/STREAM`` once more, as PNG.
 """
 
 from __future__ import annotations
 
-import dataclasses
 import itertools
 import math
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, NamedTuple
 
 import cv2
@@ -38,6 +37,7 @@ from readers.streams import (
 from workbench.rrd_file import RrdFile, blobs
 
 ROOT = "/sensors/streams"
+GREY = "/sensors/grey"
 ARCHETYPE = "Sample"
 _SCALARS = "Scalars:scalars"
 
@@ -89,17 +89,16 @@ FORMS = {
 }
 
 
-def entity_of(stream: str) -> str:
-    """Where the samples of a stream stand."""
-    return "/".join([ROOT, *(rr.escape_entity_path_part(part) for part in stream.split("/") if part)])
+def entity_of(stream: str, root: str = ROOT) -> str:
+    """Where the samples of a stream stand; under `GREY` their grey levels."""
+    return "/".join([root, *(rr.escape_entity_path_part(part) for part in stream.split("/") if part)])
 
 
-class Row(NamedTuple):
-    """A sample as it was told to the log, its place in the order of arrival, and its grey levels as PNG if needed."""
+class Stored(NamedTuple):
+    """A sample of the log and its place in the order of arrival; of an image that was read without its payload."""
 
     order: int
     sample: Sample
-    grey: bytes
 
 
 # ---------------------------------------------------------------------------------- writing
@@ -110,7 +109,8 @@ class SampleLog:
 
     def __init__(self, file: RrdFile) -> None:
         self._file = file
-        self._rows: list[Row] = []
+        self._rows: list[Stored] = []
+        self._greys: list[tuple[ImageSample, bytes]] = []
         self._named: set[str] = set()
         self._count = 0
         self.bytes = 0
@@ -126,20 +126,23 @@ class SampleLog:
         kept = decoded if isinstance(decoded, Problem) else original
         order, self._count = self._count, self._count + 1
         if type(kept).__name__ in FORMS:
-            grey = _grey(original, decoded)
-            self._rows.append(Row(order, kept, grey))
-            self.bytes += len(grey)
+            self._rows.append(Stored(order, kept))
+        if isinstance(original, ImageSample) and isinstance(decoded, ImageSample) and _differs(original, decoded):
+            self._greys.append((original, _png(decoded)))
+            self.bytes += len(self._greys[-1][1])
 
     def write(self) -> None:
         """Send what is buffered."""
-        rows, self._rows, self.bytes = self._rows, [], 0
-        groups: dict[tuple[str, str, bool], list[Row]] = {}
-        for row in rows:
-            groups.setdefault((row.sample.stream, type(row.sample).__name__, bool(row.grey)), []).append(row)
-        for (stream, kind, _), group in groups.items():
+        rows, greys = self._rows, self._greys
+        self._rows, self._greys, self.bytes = [], [], 0
+        for (stream, kind), group in _grouped(rows, lambda row: (row.sample.stream, type(row.sample).__name__)):
             self._send(entity_of(stream), FORMS[kind], group)
+        for stream, images in _grouped(greys, lambda grey: grey[0].stream):
+            columns = rr.DynamicArchetype.columns(ARCHETYPE, components={"grey": blobs([data for _, data in images])})
+            frames, t_ns = (np.array([getattr(s, name) for s, _ in images], np.int64) for name in ("frame", "t_ns"))
+            self._file.send(entity_of(stream, GREY), frames, t_ns, columns)
 
-    def _send(self, entity: str, form: Form, rows: Sequence[Row]) -> None:
+    def _send(self, entity: str, form: Form, rows: Sequence[Stored]) -> None:
         samples = [row.sample for row in rows]
         numbers = [_numbers(form, sample) for sample in samples]
         components: dict[str, Any] = {
@@ -158,8 +161,6 @@ class SampleLog:
             columns += rr.Scalars.columns(scalars=np.concatenate(numbers)).partition([len(n) for n in numbers])
         elif form.numbers:
             lists["values"] = numbers
-        if rows[0].grey:
-            components["grey"] = blobs([row.grey for row in rows])
         columns += rr.DynamicArchetype.columns(ARCHETYPE, components=components)
         for name, values in lists.items():
             flat: Any = list(itertools.chain(*values)) if name == "texts" else np.concatenate(values)
@@ -190,15 +191,22 @@ def _names(form: Form) -> Iterable[str]:
             yield f"{name}[{','.join(map(str, index))}]" if index else name
 
 
-def _grey(original: Sample, decoded: Sample) -> bytes:
-    """The grey levels as PNG, where the picture in the log would not give back the same."""
-    if not (isinstance(original, ImageSample) and isinstance(decoded, ImageSample)):
-        return b""
-    if original is decoded or original.media_type is not None or is_grey(original.encoding):
-        return b""
-    good, data = cv2.imencode(".png", decoded.grey(), [cv2.IMWRITE_PNG_COMPRESSION, 1])
+def _grouped(items: Iterable[Any], key: Callable[[Any], Any]) -> list[tuple[Any, list[Any]]]:
+    groups: dict[Any, list[Any]] = {}
+    for item in items:
+        groups.setdefault(key(item), []).append(item)
+    return list(groups.items())
+
+
+def _differs(original: ImageSample, decoded: ImageSample) -> bool:
+    """Whether the picture in the log may not give back the grey levels: it is a picture in colour, made for the log."""
+    return original is not decoded and original.media_type is None and not is_grey(original.encoding)
+
+
+def _png(sample: ImageSample) -> bytes:
+    good, data = cv2.imencode(".png", sample.grey(), [cv2.IMWRITE_PNG_COMPRESSION, 1])
     if not good:
-        raise ImageError(f"{original.source or original.stream}: the grey levels cannot be encoded as PNG")
+        raise ImageError(f"{sample.source or sample.stream}: the grey levels cannot be encoded as PNG")
     return bytes(data)
 
 
@@ -208,15 +216,6 @@ def is_grey(encoding: str) -> bool:
 
 
 # ---------------------------------------------------------------------------------- reading
-
-
-@dataclasses.dataclass(slots=True)
-class Stored:
-    """A sample of the log: its place in the order of arrival, and the sample; an image without its payload."""
-
-    order: int
-    sample: Sample
-    grey: bytes | None = None
 
 
 def samples_of(stream: str, batches: Iterable[pa.RecordBatch]) -> list[Stored]:
@@ -237,7 +236,7 @@ def _of_batch(stream: str, batch: pa.RecordBatch) -> Iterable[Stored]:
     orders, received, kinds = (column(f"{ARCHETYPE}:{name}") for name in ("order", "received_ns", "class"))
     numbers = _arrays(batch, f"{ARCHETYPE}:values" if f"{ARCHETYPE}:values" in names else _SCALARS, np.float64)
     ids = _arrays(batch, f"{ARCHETYPE}:ids", np.int64)
-    texts, greys, frames = column(f"{ARCHETYPE}:texts"), column(f"{ARCHETYPE}:grey"), column("frame")
+    texts, frames = column(f"{ARCHETYPE}:texts"), column("frame")
     for i in range(batch.num_rows):
         form = FORMS[kinds[i][0]]
         words = texts[i] or []
@@ -253,11 +252,7 @@ def _of_batch(stream: str, batch: pa.RecordBatch) -> Iterable[Stored]:
             fields["kind"] = StreamKind(fields["kind"])
         if form.kind is ImageSample:
             fields |= {"encoding": "", "payload": b""}
-        yield Stored(orders[i][0], form.kind(**common, **fields), None if greys[i] is None else _blob(greys[i]))
-
-
-def _blob(value: Any) -> bytes:
-    return bytes(value[0])
+        yield Stored(orders[i][0], form.kind(**common, **fields))
 
 
 def _arrays(batch: pa.RecordBatch, name: str, kind: Any) -> list[NDArray[Any]]:

@@ -812,6 +812,7 @@ class _Session:
                 "recording": str(self.request.path),
                 "digest": self.digest,
                 "image_stream": self.chosen.frames,
+                "other_streams": list(self.chosen.others),
                 "reference_stream": self.chosen.reference.stream,
                 "reference_offset_s": self.request.reference_offset_s,
             },

@@ -1,0 +1,583 @@
+"""What if: a window of a run once more with other settings, from the state that the run had then.
+
+The state before the window comes from the nearest checkpoint, carried on with the run's own settings; from there the
+window is replayed with the new ones on the logged samples. Nothing of the original recording is needed. Numbers that
+stay the same are the same bit for bit.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import re
+import tomllib
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from numpy.typing import NDArray
+from pydantic import BaseModel
+
+from pipelines.estimator import Estimator, EstimatorError, Resumable, Step
+from pipelines.geometry import wrap_angle
+from pipelines.replay import stepped
+from pipelines.verdict import Verdict, flags
+from readers.streams import RecordingError, Sample, StreamError
+from workbench import checkpoints
+from workbench.schema import Archetype, schema_of
+from workbench.settings import (
+    Layer,
+    Plugin,
+    SettingsError,
+    parse_override,
+    plugin,
+    read_settings,
+    settings_values,
+    to_toml,
+    validated,
+)
+
+Floats = NDArray[np.float64]
+AGAIN = "replay the recording again"
+_SELDOM = ("frame", "t_ns", "received_ns", "verdict", "alarms")
+
+
+@dataclass(frozen=True, slots=True, kw_only=True)
+class Question:
+    """What a user asks.
+
+    `start` and `stop` are a frame's number (``120``) or a time: seconds after the run's first frame (``12.5s``),
+    nanoseconds (15 digits or more) or ISO 8601; the window is half-open. `overrides` and `settings_file` are laid
+    over the run's settings. `name` is that of the answer; None: made of the settings.
+    """
+
+    run: Path
+    start: str | None = None
+    stop: str | None = None
+    overrides: tuple[str, ...] = ()
+    settings_file: Path | None = None
+    name: str | None = None
+
+
+class Change(NamedTuple):
+    """A number of a field that differs: where it stands, before, after, and the difference by the field's usual size.
+
+    The size is infinite where only one of the two is a number.
+    """
+
+    field: str
+    old: float
+    new: float
+    size: float
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """One frame, old against new.
+
+    `distance_m` and `turn_rad` are the differences of the poses (NaN where the steps have none), `range_share` the
+    largest relative difference of a landmark's range; `changes` one entry for each field that differs, the largest
+    first.
+    """
+
+    frame: int
+    t_ns: int
+    old: Verdict
+    new: Verdict
+    distance_m: float
+    turn_rad: float
+    range_share: float
+    changes: tuple[Change, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """Old against new, frame by frame; `summary` says what it comes to; `values` are the fields that were asked for."""
+
+    rows: tuple[Row, ...]
+    summary: Mapping[str, Any]
+    run_file: Path
+    files: tuple[Path, ...]
+
+
+# -------------------------------------------------------------------------- the run's files
+
+
+class RunFiles(NamedTuple):
+    """A run as its RUN.toml tells it."""
+
+    folder: Path
+    name: str
+    values: Mapping[str, Any]
+
+    @property
+    def about(self) -> Mapping[str, Any]:
+        """The table ``run``."""
+        found: Mapping[str, Any] = self.values["run"]
+        return found
+
+    def file(self, suffix: str) -> Path:
+        """One of the run's files."""
+        return self.folder / f"{self.name}.{suffix}"
+
+
+def open_files(path: Path) -> RunFiles:
+    """The run of a RUN.rrd, a RUN.toml, or a folder with one run.
+
+    Raises:
+        RecordingError: there is none, there are several, or its RUN.toml cannot be read.
+    """
+    if path.is_dir():
+        names = sorted(
+            file.stem for file in path.glob("*.toml") if file.name != "sensors.toml" and ".whatif-" not in file.stem
+        )
+        if len(names) != 1:
+            problem = f"holds {len(names)} runs" + (f": {', '.join(names)}" if names else "")
+            raise RecordingError(path, problem, "name one, such as " + str(path / f"{(names or ['best'])[0]}.rrd"))
+        path = path / f"{names[0]}.toml"
+    file = path if path.suffix == ".toml" else path.with_name(path.name.removesuffix(".rrd") + ".toml")
+    try:
+        values = tomllib.loads(file.read_text("utf-8"))
+        for key in ("estimator", "digest", "image_stream", "name"):
+            values["run"][key]
+        values["settings"]
+    except OSError as error:
+        raise RecordingError(file, f"cannot be read ({error.strerror or error})", "give a RUN.rrd of a replay") from error
+    except (ValueError, KeyError, TypeError) as error:
+        raise RecordingError(file, f"is no RUN.toml of a replay ({error})", "give a RUN.rrd of a replay") from error
+    return RunFiles(file.parent, file.stem, values)
+
+
+def settings_of(estimator: Plugin, run: RunFiles) -> BaseModel:
+    """The settings of a run as they were.
+
+    Raises:
+        SettingsError: this version does not have them.
+    """
+    base = estimator.settings.model_construct(**dict.fromkeys(estimator.settings.model_fields))
+    origin = Layer(str(run.file("toml")), _with_none(estimator.settings, run.values["settings"]))
+    return validated(base, [origin]).settings
+
+
+def _with_none(model: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values from TOML, which has no word for None: a key that is missing was None."""
+    found: dict[str, Any] = {}
+    for name, info in model.model_fields.items():
+        value, inner = values.get(name), info.annotation
+        nested = isinstance(inner, type) and issubclass(inner, BaseModel) and isinstance(value, dict)
+        found[name] = _with_none(inner, value) if nested else value  # type: ignore[arg-type]
+    return found
+
+
+# ------------------------------------------------------------------------------ the answer
+
+
+def ask(question: Question) -> Answer:
+    """Replay a window of a run with other settings; write the new steps as a run of their own.
+
+    Raises:
+        WorkbenchError: it cannot be done; the text says what is missing, where, and the cure.
+    """
+    from workbench.rrd_sensors import SensorReader
+
+    run = open_files(question.run)
+    chosen = plugin(run.about["estimator"])
+    old_settings = settings_of(chosen, run)
+    new_settings = _changed(chosen, old_settings, question)
+    old, new = chosen.build(old_settings), chosen.build(new_settings)
+    name = _name(run, question)
+    _check_sensors(run, new_settings)
+    with SensorReader(run.folder / "sensors.rrd", run.about["image_stream"]) as sensors:
+        window = Window.of(question, sensors.frames, sensors.t_ns)
+        steps, verified = _replayed(run, sensors, window, old, new)
+        reference = _reference(run, window)
+    logged = _logged(run, window, new.step_type)
+    rows = tuple(_rows(logged, steps))
+    summary = _summary(run, name, window, rows, steps, logged, reference, verified)
+    summary |= {"changed_settings": _differences(old_settings, new_settings)}
+    file = _write(run, name, new, steps, summary)
+    return Answer(rows, summary, file, (run.folder / "sensors.rrd", run.file("rrd"), file))
+
+
+class Window(NamedTuple):
+    """Frames of a run: numbers and places in the list of all frames, half-open."""
+
+    frames: NDArray[np.int64]
+    first: int
+    stop: int
+
+    @classmethod
+    def of(cls, question: Question, frames: NDArray[np.int64], t_ns: NDArray[np.int64]) -> Window:
+        """The window that is asked for.
+
+        Raises:
+            StreamError: no frame lies in it.
+        """
+        first = 0 if question.start is None else _place(question.start, frames, t_ns)
+        stop = len(frames) if question.stop is None else _place(question.stop, frames, t_ns)
+        if stop <= first:
+            raise StreamError(
+                f"{question.run}: no frame from {question.start or 'the start'} to {question.stop or 'the end'}; "
+                f"the run has frames {frames[0]} to {frames[-1]}, "
+                f"{(t_ns[-1] - t_ns[0]) / 1e9:.3f} s after the first; write 120 for a frame, 12.5s for a time"
+            )
+        return cls(frames, first, stop)
+
+    @property
+    def numbers(self) -> NDArray[np.int64]:
+        """The numbers of its frames."""
+        return self.frames[self.first : self.stop]
+
+
+def _place(text: str, frames: NDArray[np.int64], t_ns: NDArray[np.int64]) -> int:
+    """Place of the first frame from a number or a time on."""
+    from workbench.inputs import parse_time
+
+    if re.fullmatch(r"-?\d{1,14}", text):
+        return int(np.searchsorted(frames, int(text)))
+    later = t_ns >= parse_time(text.removesuffix("s"), int(t_ns[0]))
+    return int(np.argmax(later)) if later.any() else len(frames)
+
+
+def _changed(chosen: Plugin, old: BaseModel, question: Question) -> BaseModel:
+    file = question.settings_file
+    layers = [] if file is None else [Layer(str(file), read_settings(file, chosen.settings))]
+    layers += [Layer(f"--set {text}", parse_override(text)) for text in question.overrides]
+    return validated(old, layers).settings
+
+
+def _name(run: RunFiles, question: Question) -> str:
+    """The name of the new run: that of the old one and what is asked.
+
+    Raises:
+        SettingsError: it cannot be a name.
+    """
+    words = question.name or "_".join(question.overrides) or (
+        question.settings_file.stem if question.settings_file else "same"
+    )
+    name = words if question.name else re.sub(r"[^A-Za-z0-9.]+", "-", words).strip("-.")[:60]
+    whole = f"{run.name}.whatif-{name}"
+    if not re.fullmatch(r"[A-Za-z0-9_.-]{1,99}", whole):
+        raise SettingsError(f"--name {name!r}: use letters, digits, dot, dash, underscore")
+    return whole
+
+
+def _check_sensors(run: RunFiles, settings: BaseModel) -> None:
+    """See that sensors.rrd holds what this run got.
+
+    Raises:
+        RecordingError: it is missing, or of another recording, window or choice of streams.
+        StreamError: a changed setting names a stream that is not in it.
+    """
+    file = run.folder / "sensors.rrd"
+    try:
+        values = tomllib.loads(file.with_suffix(".toml").read_text("utf-8"))
+    except (OSError, ValueError):
+        values = None
+    if values is None or not file.is_file():
+        raise RecordingError(file, "is missing or was not finished", f"{AGAIN} into this folder")
+    if values.get("digest") != run.about["digest"]:
+        raise RecordingError(file, f"is of another recording than {run.name}", f"{AGAIN} into a folder of its own")
+    if "other_streams" not in run.about or "streams" not in values:
+        raise RecordingError(run.file("toml"), "is of an older version, which kept no samples", AGAIN)
+    same = values.get("frame_stream") == run.about["image_stream"] and values.get("window") == run.values.get("window")
+    if not same:
+        problem = f"was written again for another window or stream of frames than {run.name} has"
+        raise RecordingError(file, problem, f"{AGAIN}, best into a folder of its own (-o)")
+    missing = sorted({*run.about["other_streams"]} - {*values["streams"]})
+    if missing:
+        raise RecordingError(file, f"holds no samples of {', '.join(missing)}", f"{AGAIN} into this folder")
+    height = getattr(settings, "height_stream", "")
+    if height and height not in run.about["other_streams"]:
+        raise StreamError(f"height_stream = {height!r}: the run {run.name} did not read it; {AGAIN} with it")
+
+
+def _replayed(
+    run: RunFiles, sensors: Any, window: Window, old: Estimator[Any], new: Estimator[Any]
+) -> tuple[list[Step], int]:
+    """The steps of the window under the new settings; and on how many frames before it the log was met exactly.
+
+    Raises:
+        RecordingError: there is no state to begin with, or it does not lead to the numbers of the log.
+        EstimatorError: the new settings cannot go on from the old state.
+    """
+    others = run.about["other_streams"]
+    last = sensors.order_of(int(window.frames[window.stop - 1]))
+    if window.first == 0:
+        samples = sensors.samples(others, -1, last)
+        return [step for _, step in _steps(new, new.start(), samples)], 0
+    before = int(window.frames[window.first - 1])
+    about = {"digest": run.about["digest"], "run": run.name, "estimator": run.about["estimator"]}
+    kept = checkpoints.nearest(run.file("checkpoints"), int(window.frames[window.first]), about)
+    state = old.unpacked(kept.state, sensors.grey) if isinstance(old, Resumable) else kept.state
+    begin, switch = (sensors.order_of(kept.frame) if kept.frame >= 0 else -1), sensors.order_of(before)
+    earlier: list[Step] = []
+    for state, step in _steps(old, state, sensors.samples(others, begin, switch), every=True):
+        earlier += [] if step is None else [step]
+    _verify(run, earlier)
+    if old.settings != new.settings:
+        if not isinstance(new, Resumable):
+            raise EstimatorError(
+                f"the estimator {new.name!r} cannot go on from a state under other settings: it has no `adopted`"
+            )
+        state = new.adopted(state)
+    return [step for _, step in _steps(new, state, sensors.samples(others, switch, last))], len(earlier)
+
+
+def _steps(
+    estimator: Estimator[Any], state: Any, samples: Iterator[Sample], *, every: bool = False
+) -> Iterator[tuple[Any, Any]]:
+    """The states and steps of some samples; without `every` only where there is a step."""
+    for sample in samples:
+        state, step = stepped(estimator, state, sample)
+        if every or step is not None:
+            yield state, step
+
+
+def _verify(run: RunFiles, steps: Sequence[Step]) -> None:
+    """See that steps are those of the log, bit for bit.
+
+    Raises:
+        RecordingError: they are not: another version, or another kind of machine, wrote the run.
+    """
+    if not steps:
+        return
+    logged = _read(run, steps[0].frame, steps[-1].frame + 1, type(steps[0]))
+    for row in _rows(logged, steps):
+        if row.changes or row.old != row.new:
+            what = row.changes[0].field if row.changes else "verdict"
+            problem = f"frame {row.frame} does not come out as it was logged ({what})"
+            raise RecordingError(run.file("rrd"), problem, f"another version or machine wrote it; {AGAIN}")
+
+
+# ------------------------------------------------------------------------------- the log
+
+
+Table = Mapping[str, Sequence[Any]]
+
+
+def _logged(run: RunFiles, window: Window, step_type: type[Step]) -> Table:
+    numbers = window.numbers
+    return _read(run, int(numbers[0]), int(numbers[-1]) + 1, step_type)
+
+
+def _read(run: RunFiles, first: int, stop: int, step_type: type[Step]) -> Table:
+    """The fields of the logged steps, without surfaces, of a half-open range of frames."""
+    from workbench.rrd import read_fields
+    from workbench.rrd_excerpt import RrdParts
+
+    schema = schema_of(step_type)
+    fields = [row.field for row in schema.rows if row.archetype is not Archetype.SURFACES]
+    root = f"/runs/{run.name}/{run.about['estimator']}/"
+    entities = {root + row.entity for row in schema.rows if row.archetype in (Archetype.SCALARS, Archetype.INTEGERS)}
+    with RrdParts(run.file("rrd")) as parts:
+        wanted = [place for place in parts.of(entities) if place.overlaps(first, stop)]
+        if not wanted:
+            raise RecordingError(run.file("rrd"), f"holds no frames {first} to {stop - 1}", AGAIN)
+        table = read_fields(parts.excerpt(wanted), run.name, step_type, fields)
+    inside = [i for i, frame in enumerate(table["frame"]) if first <= frame < stop]
+    return {name: [values[i] for i in inside] for name, values in table.items()}
+
+
+def _reference(run: RunFiles, window: Window) -> Any:
+    """The reference's poses (times [n], x, y (m) and heading (rad) [n, 3]); None where the run has none in metres."""
+    from workbench.rrd_excerpt import RrdParts
+
+    if run.values.get("summary", {}).get("unit") != "m":
+        return None
+    with RrdParts(run.folder / "sensors.rrd") as parts:
+        batches = [b for _, b in parts.batches(parts.of(["/sensors/reference"])) if "Scalars:scalars" in b.schema.names]
+    if not batches:
+        return None
+    t_ns = np.concatenate([np.asarray(b.column("sensor_time").to_numpy(), np.int64) for b in batches])
+    poses = np.concatenate([b.column("Scalars:scalars").flatten().to_numpy().reshape(-1, 4) for b in batches])
+    return t_ns, poses[:, [0, 1, 3]]
+
+
+# ---------------------------------------------------------------------------- comparison
+
+
+def _rows(logged: Table, steps: Sequence[Step]) -> Iterator[Row]:
+    """Each frame, old against new."""
+    places = {frame: i for i, frame in enumerate(logged["frame"])}
+    fields = [name for name in logged if name not in _SELDOM]
+    usual = {name: _size(logged[name]) for name in fields}
+    for step in steps:
+        i = places.get(step.frame)
+        if i is None:
+            raise RecordingError(Path("the log"), f"holds no frame {step.frame}", AGAIN)
+        before = {name: logged[name][i] for name in logged}
+        changes = [c for name in fields if (c := _change(name, before[name], getattr(step, name), usual[name]))]
+        distance, turn = _apart(before.get("pose"), getattr(step, "pose", None))
+        yield Row(
+            step.frame,
+            step.t_ns,
+            Verdict(int(before["verdict"])),
+            step.verdict,
+            distance,
+            turn,
+            _ranges_apart(before, step),
+            tuple(sorted(changes, key=lambda change: -change.size)),
+        )
+
+
+def _size(values: Sequence[Any]) -> float:
+    """The largest finite number of a field in the window, 1 where there is none but 0."""
+    flat = np.concatenate([np.abs(np.asarray(value, np.float64)).ravel() for value in values])
+    flat = flat[np.isfinite(flat)]
+    largest = float(flat.max(initial=0.0))
+    return largest if largest > 0 else 1.0
+
+
+def _change(name: str, old: Any, new: Any, usual: float) -> Change | None:
+    """The largest difference in a field, None where all its bits are equal."""
+    a, b = (np.ascontiguousarray(value, np.float64) for value in (old, new))
+    if a.shape != b.shape:
+        return Change(f"{name}: shape", float(a.size), float(b.size), math.inf)
+    if a.tobytes() == b.tobytes():
+        return None
+    differs = a.view(np.int64).ravel() != b.view(np.int64).ravel() if a.ndim else np.array([True])
+    with np.errstate(invalid="ignore"):
+        size = np.abs(b - a).ravel() / usual
+    one_sided = np.isnan(a).ravel() != np.isnan(b).ravel()
+    size = np.where(differs, np.where(one_sided, np.inf, np.nan_to_num(size, nan=0.0, posinf=np.inf)), -1.0)
+    at = int(size.argmax())
+    index = ",".join(map(str, np.unravel_index(at, a.shape))) if a.ndim else ""
+    return Change(f"{name}[{index}]" if index else name, float(a.ravel()[at]), float(b.ravel()[at]), float(size[at]))
+
+
+def _apart(old: Any, new: Any) -> tuple[float, float]:
+    """Distance (m) and turn (rad) from one pose to another."""
+    if old is None or new is None:
+        return math.nan, math.nan
+    return float(math.hypot(new[0] - old[0], new[1] - old[1])), float(wrap_angle(float(new[2] - old[2])))
+
+
+def _ranges_apart(old: Mapping[str, Any], step: Step) -> float:
+    """Largest relative difference of a landmark's range, NaN where none is in both."""
+    new = getattr(step, "range_m", None)
+    if new is None or "range_m" not in old:
+        return math.nan
+    before = dict(zip(np.asarray(old["landmark_id"]).tolist(), np.asarray(old["range_m"]).tolist(), strict=True))
+    after = dict(zip(step.landmark_id.tolist(), new.tolist(), strict=True))  # type: ignore[attr-defined]
+    shares = [abs(after[k] / before[k] - 1.0) for k in after if k == k and before.get(k)]
+    return float(np.nanmax(shares)) if np.isfinite(shares).any() else math.nan
+
+
+# ------------------------------------------------------------------------------- summary
+
+
+def _summary(
+    run: RunFiles,
+    name: str,
+    window: Window,
+    rows: Sequence[Row],
+    steps: Sequence[Step],
+    logged: Table,
+    reference: Any,
+    verified: int,
+) -> dict[str, Any]:
+    last = rows[-1]
+    found: dict[str, Any] = {
+        "run": run.name,
+        "whatif": name,
+        "first_frame": rows[0].frame,
+        "last_frame": last.frame,
+        "frames": len(rows),
+        "frames_verified": verified,
+        "verdicts_changed": sum(row.old != row.new for row in rows),
+        "frames_changed": sum(bool(row.changes) or row.old != row.new for row in rows),
+        "verdicts_old": _named(row.old for row in rows),
+        "verdicts_new": _named(row.new for row in rows),
+    }
+    if math.isfinite(last.distance_m):
+        found |= {"end_distance_m": last.distance_m, "end_turn_rad": last.turn_rad}
+    shares = [row.range_share for row in rows if math.isfinite(row.range_share)]
+    if shares:
+        found |= {"end_range_share": last.range_share, "median_range_share": float(np.median(shares))}
+    if reference is not None and math.isfinite(last.distance_m):
+        offset_ns = round(run.about.get("reference_offset_s", 0.0) * 1e9)
+        t_ns = np.array([step.t_ns for step in steps], np.int64) + offset_ns
+        error = partial(_reference_error, t_ns, *reference)
+        found["error_old"] = error(np.array([np.asarray(p) for p in logged["pose"]]))
+        found["error_new"] = error(np.array([step.pose for step in steps]))  # type: ignore[attr-defined]
+    return found
+
+
+def _named(verdicts: Iterator[Verdict]) -> dict[str, int]:
+    counts: dict[str, int] = {}
+    for verdict in verdicts:
+        key = "+".join(str(flag.name) for flag in flags(verdict)) or "OK"
+        counts[key] = counts.get(key, 0) + 1
+    return dict(sorted(counts.items()))
+
+
+def _reference_error(t_ns: Any, at_ns: Any, reference: Floats, poses: Floats) -> dict[str, float] | None:
+    """How the way from the first to the last frame of the window differs from the reference's, in m and rad.
+
+    Both ways are taken in the axes of their own first pose; None where the reference does not cover the window.
+    """
+    inside = np.flatnonzero((t_ns >= at_ns[0]) & (t_ns <= at_ns[-1]))
+    if len(inside) < 2:
+        return None
+    ends = inside[[0, -1]]
+    since, known = (t_ns[ends] - at_ns[0]).astype(float), (at_ns - at_ns[0]).astype(float)
+    heading = np.unwrap(reference[:, 2])
+    true = np.column_stack([np.interp(since, known, v) for v in (reference[:, 0], reference[:, 1], heading)])
+    (x, y, a), (tx, ty, ta) = _way(poses[ends]), _way(true)
+    return {"distance_m": math.hypot(x - tx, y - ty), "turn_rad": float(wrap_angle(a - ta))}
+
+
+def _way(ends: Floats) -> tuple[float, float, float]:
+    """The second pose in the axes of the first."""
+    (x0, y0, a), (x1, y1, b) = ends
+    c, s = math.cos(a), math.sin(a)
+    return c * (x1 - x0) + s * (y1 - y0), -s * (x1 - x0) + c * (y1 - y0), wrap_angle(b - a)
+
+
+def _differences(old: BaseModel, new: BaseModel) -> dict[str, list[Any]]:
+    """The settings that differ, before and after."""
+    a, b = settings_values(old), settings_values(new)
+    return {key: [a[key], b[key]] for key in a if repr(a[key]) != repr(b[key])}
+
+
+# -------------------------------------------------------------------------------- writing
+
+
+def _write(run: RunFiles, name: str, new: Estimator[Any], steps: Sequence[Step], summary: Mapping[str, Any]) -> Path:
+    """Write the new steps as a run of its own beside the old one: the recording, and its TOML."""
+    from workbench.rrd import RunWriter
+
+    file = run.folder / f"{name}.rrd"
+    with ExitStack() as files:
+        writer = files.enter_context(
+            RunWriter(
+                file,
+                recording_id=str(run.about["digest"])[:32],
+                run=name,
+                estimator=new.name,
+                step_type=new.step_type,
+                settings_text=to_toml(settings_values(new.settings)),
+            )
+        )
+        for step in steps:
+            writer.step(step)
+        flat = {key: value if isinstance(value, int | float | str) else str(value) for key, value in summary.items()}
+        writer.finish(flat, None)
+    values = {
+        **run.values,
+        "run": {**run.about, "name": name},
+        "window": {**run.values.get("window", {}), "first_frame": steps[0].frame, "last_frame": steps[-1].frame},
+        "settings": settings_values(new.settings),
+        "summary": summary,
+    }
+    part = file.with_suffix(".toml.part")
+    part.write_text(to_toml(values), encoding="utf-8")
+    part.replace(run.folder / f"{name}.toml")
+    return file
+
+
