@@ -52,6 +52,7 @@ from workbench.rrd_file import (
     document,
     flat,
     marker,
+    numbers,
     texts,
 )
 from workbench.rrd_ranges import RangeDrawing
@@ -517,8 +518,8 @@ def _whole_rows(chunks: Iterable[Any], needed: Iterable[Row]) -> dict[tuple[str,
         batch = chunk.to_record_batch()
         for component in batch.schema.names:
             if (entity, component) in parts:
-                frames = batch.column("frame").to_numpy()
-                t_ns = batch.column("sensor_time").to_numpy().astype(np.int64)
+                frames = numbers(batch.column("frame"))
+                t_ns = numbers(batch.column("sensor_time"))
                 parts[entity, component].append((frames, t_ns, _lists(batch.column(component))))
     whole = functools.reduce(np.intersect1d, (_concatenated(part)[0] for part in parts.values()))
     return {key: _only(whole, *_concatenated(part)) for key, part in parts.items()}
@@ -573,7 +574,7 @@ def _lists(column: pa.ListArray) -> list[Any]:
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
         return list(column.to_pylist())
     bounds = np.cumsum([0, *column.value_lengths().to_pylist()])
-    flat = column.flatten().to_numpy(zero_copy_only=False)
+    flat = numbers(column.flatten())
     return [flat[a:b] for a, b in itertools.pairwise(bounds)]
 
 

@@ -35,6 +35,7 @@ from readers.streams import (
     TrackSample,
 )
 from workbench.rrd_file import RrdFile, blobs
+from workbench.rrd_file import numbers as plain
 
 ROOT = "/sensors/streams"
 GREY = "/sensors/grey"
@@ -218,21 +219,34 @@ def is_grey(encoding: str) -> bool:
 # ---------------------------------------------------------------------------------- reading
 
 
-def samples_of(stream: str, batches: Iterable[pa.RecordBatch]) -> list[Stored]:
-    """The samples of a stream out of the rows of its entity, in the order of arrival."""
-    found = [stored for batch in batches for stored in _of_batch(stream, batch)]
+def samples_of(stream: str, batches: Iterable[pa.RecordBatch], after: int, upto: int) -> list[Stored]:
+    """The samples of a stream out of the columns of its entity, in the order of arrival.
+
+    Only those from behind one place in that order up to another included.
+    """
+    found: list[Stored] = []
+    for batch in batches:
+        order = order_of(batch)
+        rows = np.flatnonzero((order > after) & (order <= upto))
+        if len(rows):
+            first = int(rows[0])
+            part = _of_batch(stream, batch.slice(first, int(rows[-1]) + 1 - first))
+            found += (stored for stored in part if after < stored.order <= upto)
     return sorted(found, key=lambda stored: stored.order)
+
+
+def order_of(batch: pa.RecordBatch) -> NDArray[np.int64]:
+    """Places of the rows in the order of arrival."""
+    return np.asarray(plain(batch.column(f"{ARCHETYPE}:order").flatten()), np.int64)
 
 
 def _of_batch(stream: str, batch: pa.RecordBatch) -> Iterable[Stored]:
     names = batch.schema.names
-    if f"{ARCHETYPE}:class" not in names:
-        return
 
     def column(name: str) -> list[Any]:
         return batch.column(name).to_pylist() if name in names else [None] * batch.num_rows
 
-    t_ns = batch.column("sensor_time").cast(pa.int64()).to_pylist()
+    t_ns = plain(batch.column("sensor_time")).tolist()
     orders, received, kinds = (column(f"{ARCHETYPE}:{name}") for name in ("order", "received_ns", "class"))
     numbers = _arrays(batch, f"{ARCHETYPE}:values" if f"{ARCHETYPE}:values" in names else _SCALARS, np.float64)
     ids = _arrays(batch, f"{ARCHETYPE}:ids", np.int64)
@@ -261,7 +275,7 @@ def _arrays(batch: pa.RecordBatch, name: str, kind: Any) -> list[NDArray[Any]]:
         return [np.empty(0, kind)] * batch.num_rows
     column = batch.column(name)
     lengths = [n or 0 for n in column.value_lengths().to_pylist()]
-    flat = column.flatten().to_numpy(zero_copy_only=False).astype(kind, copy=False)
+    flat = plain(column.flatten()).astype(kind, copy=False)
     bounds = np.cumsum([0, *lengths])
     return [flat[a:b] for a, b in itertools.pairwise(bounds)]
 

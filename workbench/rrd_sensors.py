@@ -14,10 +14,11 @@ from numpy.typing import NDArray
 from pipelines.replay import grey_sample
 from readers.streams import ImageSample, RecordingError, Sample
 from workbench.rrd_excerpt import Place, RrdParts
-from workbench.rrd_file import IMAGE
-from workbench.rrd_samples import ARCHETYPE, GREY, Stored, entity_of, samples_of
+from workbench.rrd_file import IMAGE, numbers
+from workbench.rrd_samples import ARCHETYPE, GREY, Stored, entity_of, order_of, samples_of
 
 Ints = NDArray[np.int64]
+_SCALARS = "Scalars:scalars"
 _CURE = "replay the recording again"
 
 
@@ -76,8 +77,7 @@ class SensorReader:
         """
         chosen: list[Stored] = []
         for stream in dict.fromkeys([self._stream, *streams]):
-            batches = (_between(batch, after, upto) for batch in self._of(stream))
-            chosen += samples_of(stream, (batch for batch in batches if batch.num_rows))
+            chosen += samples_of(stream, self._of(stream), after, upto)
         for stored in sorted(chosen, key=lambda one: one.order):
             sample = stored.sample
             yield grey_sample(self._whole(sample)) if isinstance(sample, ImageSample) else sample
@@ -101,9 +101,9 @@ class SensorReader:
         if not batches:
             problem = f"holds no samples of {self._stream}: an older version wrote it"
             raise RecordingError(self._path, problem, _CURE)
-        frames = np.concatenate([batch.column("frame").to_numpy() for batch in batches])
-        order = np.concatenate([_order(batch) for batch in batches])
-        t_ns = np.concatenate([batch.column("sensor_time").cast(pa.int64()).to_numpy() for batch in batches])
+        frames = np.concatenate([numbers(batch.column("frame")) for batch in batches])
+        order = np.concatenate([order_of(batch) for batch in batches])
+        t_ns = np.concatenate([numbers(batch.column("sensor_time")) for batch in batches])
         rising = np.argsort(frames, kind="stable")
         return frames[rising], order[rising], t_ns[rising]
 
@@ -141,14 +141,19 @@ class SensorReader:
         return self._held[place]
 
 
-def _order(batch: pa.RecordBatch) -> Ints:
-    column = batch.column(f"{ARCHETYPE}:order")
-    return np.asarray(column.flatten().to_numpy(zero_copy_only=False), np.int64)
+def read_reference(path: Path) -> tuple[Ints, NDArray[np.float64]] | None:
+    """The reference: sensor times [n], x, y (m) and heading (rad) [n, 3]; None where the file has none.
 
-
-def _between(batch: pa.RecordBatch, after: int, upto: int) -> pa.RecordBatch:
-    order = _order(batch)
-    return batch.filter(pa.array((order > after) & (order <= upto)))
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    with RrdParts(path) as parts:
+        batches = [b for _, b in parts.batches(parts.of(["/sensors/reference"])) if _SCALARS in b.schema.names]
+    if not batches:
+        return None
+    t_ns = np.concatenate([numbers(batch.column("sensor_time")) for batch in batches])
+    poses = np.concatenate([numbers(batch.column(_SCALARS).flatten()).reshape(-1, 4) for batch in batches])
+    return t_ns, poses[:, [0, 1, 3]]
 
 
 def _images(batch: pa.RecordBatch) -> Iterator[tuple[int, ImageSample]]:
@@ -158,18 +163,18 @@ def _images(batch: pa.RecordBatch) -> Iterator[tuple[int, ImageSample]]:
         blobs, media = batch.column("EncodedImage:blob"), batch.column("EncodedImage:media_type").to_pylist()
         for i, frame in enumerate(frames):
             if blobs[i].is_valid and len(blobs[i].values):
-                data = blobs[i].values[0].values.to_numpy(zero_copy_only=False).tobytes()
+                data = numbers(blobs[i].values[0].values).tobytes()
                 yield frame, _image(frame, encoding=media[i][0].removeprefix("image/"), payload=data)
     elif f"{ARCHETYPE}:grey" in names:
         greys = batch.column(f"{ARCHETYPE}:grey")
         for i, frame in enumerate(frames):
-            data = greys[i].values[0].values.to_numpy(zero_copy_only=False).tobytes()
+            data = numbers(greys[i].values[0].values).tobytes()
             yield frame, _image(frame, encoding="png", payload=data)
     elif "Image:buffer" in names:
         buffers, formats = batch.column("Image:buffer"), batch.column("Image:format").to_pylist()
         for i, frame in enumerate(frames):
             (form,) = formats[i]
-            data = buffers[i].values[0].values.to_numpy(zero_copy_only=False).tobytes()
+            data = numbers(buffers[i].values[0].values).tobytes()
             wide = len(data) == 2 * form["width"] * form["height"]
             yield frame, _image(
                 frame,

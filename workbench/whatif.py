@@ -7,12 +7,10 @@ stay the same are the same bit for bit.
 
 from __future__ import annotations
 
-import dataclasses
 import math
 import re
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import ExitStack
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -42,6 +40,9 @@ from workbench.settings import (
 )
 
 Floats = NDArray[np.float64]
+Table = Mapping[str, Sequence[Any]]
+"""Fields of logged steps: one value per frame."""
+
 AGAIN = "replay the recording again"
 _SELDOM = ("frame", "t_ns", "received_ns", "verdict", "alarms")
 
@@ -52,7 +53,7 @@ class Question:
 
     `start` and `stop` are a frame's number (``120``) or a time: seconds after the run's first frame (``12.5s``),
     nanoseconds (15 digits or more) or ISO 8601; the window is half-open. `overrides` and `settings_file` are laid
-    over the run's settings. `name` is that of the answer; None: made of the settings.
+    over the run's settings. `name` is that of the answer; None: made of the settings. `fields` are those to show.
     """
 
     run: Path
@@ -61,12 +62,13 @@ class Question:
     overrides: tuple[str, ...] = ()
     settings_file: Path | None = None
     name: str | None = None
+    fields: tuple[str, ...] = ()
 
 
 class Change(NamedTuple):
     """A number of a field that differs: where it stands, before, after, and the difference by the field's usual size.
 
-    The size is infinite where only one of the two is a number.
+    A number that comes or goes (the other is NaN) counts as that usual size.
     """
 
     field: str
@@ -96,12 +98,30 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """Old against new, frame by frame; `summary` says what it comes to; `values` are the fields that were asked for."""
+    """Old against new, frame by frame.
 
+    `steps` are the new ones and `logged` the fields of the old ones, `fields` those that were asked for, `summary`
+    what it comes to.
+    """
+
+    run: RunFiles
+    name: str
+    estimator: Estimator[Any]
     rows: tuple[Row, ...]
+    steps: tuple[Step, ...]
+    logged: Table
+    fields: tuple[str, ...]
     summary: Mapping[str, Any]
-    run_file: Path
-    files: tuple[Path, ...]
+
+    @property
+    def run_file(self) -> Path:
+        """The recording of the new steps."""
+        return self.run.folder / f"{self.name}.rrd"
+
+    @property
+    def files(self) -> tuple[Path, ...]:
+        """What to open in the viewer: measurements, old steps, new steps."""
+        return self.run.folder / "sensors.rrd", self.run.file("rrd"), self.run_file
 
 
 # -------------------------------------------------------------------------- the run's files
@@ -177,7 +197,7 @@ def _with_none(model: type[BaseModel], values: Mapping[str, Any]) -> dict[str, A
 
 
 def ask(question: Question) -> Answer:
-    """Replay a window of a run with other settings; write the new steps as a run of their own.
+    """Replay a window of a run with other settings.
 
     Raises:
         WorkbenchError: it cannot be done; the text says what is missing, where, and the cure.
@@ -190,6 +210,7 @@ def ask(question: Question) -> Answer:
     new_settings = _changed(chosen, old_settings, question)
     old, new = chosen.build(old_settings), chosen.build(new_settings)
     name = _name(run, question)
+    _check_fields(question, new.step_type)
     _check_sensors(run, new_settings)
     with SensorReader(run.folder / "sensors.rrd", run.about["image_stream"]) as sensors:
         window = Window.of(question, sensors.frames, sensors.t_ns)
@@ -199,8 +220,7 @@ def ask(question: Question) -> Answer:
     rows = tuple(_rows(logged, steps))
     summary = _summary(run, name, window, rows, steps, logged, reference, verified)
     summary |= {"changed_settings": _differences(old_settings, new_settings)}
-    file = _write(run, name, new, steps, summary)
-    return Answer(rows, summary, file, (run.folder / "sensors.rrd", run.file("rrd"), file))
+    return Answer(run, name, new, rows, tuple(steps), logged, question.fields, summary)
 
 
 class Window(NamedTuple):
@@ -264,6 +284,13 @@ def _name(run: RunFiles, question: Question) -> str:
     if not re.fullmatch(r"[A-Za-z0-9_.-]{1,99}", whole):
         raise SettingsError(f"--name {name!r}: use letters, digits, dot, dash, underscore")
     return whole
+
+
+def _check_fields(question: Question, step_type: type[Step]) -> None:
+    known = [row.field for row in schema_of(step_type).rows if row.archetype is not Archetype.SURFACES]
+    for name in question.fields:
+        if name not in known:
+            raise StreamError(f"--fields {name}: the steps have no such number; they have {', '.join(known)}")
 
 
 def _check_sensors(run: RunFiles, settings: BaseModel) -> None:
@@ -357,9 +384,6 @@ def _verify(run: RunFiles, steps: Sequence[Step]) -> None:
 # ------------------------------------------------------------------------------- the log
 
 
-Table = Mapping[str, Sequence[Any]]
-
-
 def _logged(run: RunFiles, window: Window, step_type: type[Step]) -> Table:
     numbers = window.numbers
     return _read(run, int(numbers[0]), int(numbers[-1]) + 1, step_type)
@@ -385,17 +409,11 @@ def _read(run: RunFiles, first: int, stop: int, step_type: type[Step]) -> Table:
 
 def _reference(run: RunFiles, window: Window) -> Any:
     """The reference's poses (times [n], x, y (m) and heading (rad) [n, 3]); None where the run has none in metres."""
-    from workbench.rrd_excerpt import RrdParts
-
     if run.values.get("summary", {}).get("unit") != "m":
         return None
-    with RrdParts(run.folder / "sensors.rrd") as parts:
-        batches = [b for _, b in parts.batches(parts.of(["/sensors/reference"])) if "Scalars:scalars" in b.schema.names]
-    if not batches:
-        return None
-    t_ns = np.concatenate([np.asarray(b.column("sensor_time").to_numpy(), np.int64) for b in batches])
-    poses = np.concatenate([b.column("Scalars:scalars").flatten().to_numpy().reshape(-1, 4) for b in batches])
-    return t_ns, poses[:, [0, 1, 3]]
+    from workbench.rrd_sensors import read_reference
+
+    return read_reference(run.folder / "sensors.rrd")
 
 
 # ---------------------------------------------------------------------------- comparison
@@ -444,7 +462,7 @@ def _change(name: str, old: Any, new: Any, usual: float) -> Change | None:
     with np.errstate(invalid="ignore"):
         size = np.abs(b - a).ravel() / usual
     one_sided = np.isnan(a).ravel() != np.isnan(b).ravel()
-    size = np.where(differs, np.where(one_sided, np.inf, np.nan_to_num(size, nan=0.0, posinf=np.inf)), -1.0)
+    size = np.where(differs, np.where(one_sided, 1.0, np.nan_to_num(size, nan=0.0, posinf=np.inf)), -1.0)
     at = int(size.argmax())
     index = ",".join(map(str, np.unravel_index(at, a.shape))) if a.ndim else ""
     return Change(f"{name}[{index}]" if index else name, float(a.ravel()[at]), float(b.ravel()[at]), float(size[at]))
@@ -508,10 +526,10 @@ def _summary(
     return found
 
 
-def _named(verdicts: Iterator[Verdict]) -> dict[str, int]:
+def _named(verdicts: Iterable[Verdict]) -> dict[str, int]:
     counts: dict[str, int] = {}
     for verdict in verdicts:
-        key = "+".join(str(flag.name) for flag in flags(verdict)) or "OK"
+        key = _verdict(verdict)
         counts[key] = counts.get(key, 0) + 1
     return dict(sorted(counts.items()))
 
@@ -545,39 +563,145 @@ def _differences(old: BaseModel, new: BaseModel) -> dict[str, list[Any]]:
     return {key: [a[key], b[key]] for key in a if repr(a[key]) != repr(b[key])}
 
 
+# --------------------------------------------------------------------------- for reading
+
+_MOST = 2
+"""So many of a frame's changed fields stand in the table."""
+
+
+def cells(answer: Answer) -> tuple[list[str], list[list[str]]]:
+    """The table: its heads, and a row for each frame."""
+    path = any(math.isfinite(row.distance_m) for row in answer.rows)
+    apart = ["apart", "turned"] if path else ["ranges"]
+    heads = ["frame", "time", "old", "new", *apart, *answer.fields, "" if answer.fields else "changed most"]
+    places = {frame: i for i, frame in enumerate(answer.logged["frame"])}
+    rows = []
+    for row, step in zip(answer.rows, answer.steps, strict=True):
+        shown = [f"{(row.t_ns - answer.rows[0].t_ns) / 1e9:.3f} s", _verdict(row.old), _verdict(row.new)]
+        shown += [_metres(row.distance_m), _degrees(row.turn_rad)] if path else [_share(row.range_share)]
+        for name in answer.fields:
+            shown.append(f"{_value(answer.logged[name][places[row.frame]])} → {_value(getattr(step, name))}")
+        most = "  ".join(f"{c.field} {c.old:.4g} → {c.new:.4g}" for c in row.changes[:_MOST])
+        rows.append([str(row.frame), *shown, "" if answer.fields else most or "nothing"])
+    return heads, rows
+
+
+def summary_lines(answer: Answer) -> list[str]:
+    """What the answer comes to, a line each."""
+    s = answer.summary
+    said = [f"{key}: {old} → {new}" for key, (old, new) in s["changed_settings"].items()]
+    lines = [
+        f"settings     {'; '.join(said) or 'as they were'}",
+        f"window       frames {s['first_frame']} to {s['last_frame']}, {s['frames']} of them; "
+        f"{s['frames_verified']} before it came out as logged",
+        f"verdict      changed in {s['verdicts_changed']} frames; numbers in {s['frames_changed']}",
+        f"old          {_counts(s['verdicts_old'])}",
+        f"new          {_counts(s['verdicts_new'])}",
+    ]
+    if "end_distance_m" in s:
+        lines.append(f"at its end   {_metres(s['end_distance_m'])} apart, turned by {_degrees(s['end_turn_rad'])}")
+    if "end_range_share" in s:
+        share, median = _share(s["end_range_share"]), _share(s["median_range_share"])
+        lines.append(f"ranges       differ by up to {share} at its end, by up to {median} in the median frame")
+    if s.get("error_old") and s.get("error_new"):
+        old, new = (f"{_metres(e['distance_m'])}, {_degrees(e['turn_rad'])}" for e in (s["error_old"], s["error_new"]))
+        lines.append(f"reference    error over the window {old} before, {new} now")
+    return [*lines, f"result       {answer.run_file}"]
+
+
+def values_of(answer: Answer) -> dict[str, Any]:
+    """The answer as plain values: the summary, and a row for each frame."""
+    places = {frame: i for i, frame in enumerate(answer.logged["frame"])}
+
+    def fields(row: Row, step: Step) -> dict[str, Any]:
+        return {
+            name: {
+                "old": np.asarray(answer.logged[name][places[row.frame]]).tolist(),
+                "new": np.asarray(getattr(step, name)).tolist(),
+            }
+            for name in answer.fields
+        }
+
+    rows = [
+        {
+            "frame": row.frame,
+            "t_ns": row.t_ns,
+            "old": _verdict(row.old),
+            "new": _verdict(row.new),
+            "distance_m": row.distance_m,
+            "turn_rad": row.turn_rad,
+            "range_share": row.range_share,
+            "changes": [{**change._asdict()} for change in row.changes],
+            "fields": fields(row, step),
+        }
+        for row, step in zip(answer.rows, answer.steps, strict=True)
+    ]
+    return {"summary": dict(answer.summary), "run_file": str(answer.run_file), "frames": rows}
+
+
+def _verdict(verdict: Verdict) -> str:
+    return "+".join(str(flag.name) for flag in flags(verdict)) or "OK"
+
+
+def _counts(verdicts: Mapping[str, int]) -> str:
+    return ", ".join(f"{count} {name}" for name, count in verdicts.items())
+
+
+def _metres(value: float) -> str:
+    return "-" if not math.isfinite(value) else "0" if value == 0 else f"{value:.3g} m"
+
+
+def _degrees(value: float) -> str:
+    return "-" if not math.isfinite(value) else "0" if value == 0 else f"{math.degrees(value):.3g}°"
+
+
+def _share(value: float) -> str:
+    return "-" if not math.isfinite(value) else "0" if value == 0 else f"{100 * value:.3g} %"
+
+
+def _value(value: Any) -> str:
+    """A number, or the smallest and largest of several."""
+    flat = np.asarray(value, np.float64).ravel()
+    finite = flat[np.isfinite(flat)]
+    if not len(finite):
+        return "nan"
+    if len(flat) == 1:
+        return f"{flat[0]:.4g}"
+    return f"{finite.min():.4g}…{finite.max():.4g}"
+
+
 # -------------------------------------------------------------------------------- writing
 
 
-def _write(run: RunFiles, name: str, new: Estimator[Any], steps: Sequence[Step], summary: Mapping[str, Any]) -> Path:
-    """Write the new steps as a run of its own beside the old one: the recording, and its TOML."""
+def write(answer: Answer) -> None:
+    """Write the new steps as a run of its own beside the old one: the recording, and its TOML.
+
+    Raises:
+        WorkbenchError: they cannot be written.
+    """
     from workbench.rrd import RunWriter
 
-    file = run.folder / f"{name}.rrd"
-    with ExitStack() as files:
-        writer = files.enter_context(
-            RunWriter(
-                file,
-                recording_id=str(run.about["digest"])[:32],
-                run=name,
-                estimator=new.name,
-                step_type=new.step_type,
-                settings_text=to_toml(settings_values(new.settings)),
-            )
-        )
-        for step in steps:
+    run, new = answer.run, answer.estimator
+    flat = {k: v if isinstance(v, int | float | str) else str(v) for k, v in answer.summary.items()}
+    with RunWriter(
+        answer.run_file,
+        recording_id=str(run.about["digest"])[:32],
+        run=answer.name,
+        estimator=new.name,
+        step_type=new.step_type,
+        settings_text=to_toml(settings_values(new.settings)),
+    ) as writer:
+        for step in answer.steps:
             writer.step(step)
-        flat = {key: value if isinstance(value, int | float | str) else str(value) for key, value in summary.items()}
         writer.finish(flat, None)
+    ends = {"first_frame": answer.steps[0].frame, "last_frame": answer.steps[-1].frame}
     values = {
         **run.values,
-        "run": {**run.about, "name": name},
-        "window": {**run.values.get("window", {}), "first_frame": steps[0].frame, "last_frame": steps[-1].frame},
+        "run": {**run.about, "name": answer.name},
+        "window": {**run.values.get("window", {}), **ends},
         "settings": settings_values(new.settings),
-        "summary": summary,
+        "summary": answer.summary,
     }
-    part = file.with_suffix(".toml.part")
+    part = run.folder / f"{answer.name}.toml.part"
     part.write_text(to_toml(values), encoding="utf-8")
-    part.replace(run.folder / f"{name}.toml")
-    return file
-
-
+    part.replace(run.folder / f"{answer.name}.toml")
