@@ -112,5 +112,3 @@ def _places(path: Path) -> list[Place]:
     names = ("chunk_entity_path", "chunk_byte_offset", "chunk_byte_size", "frame:start", "frame:end")
     places = [Place(*values) for values in zip(*map(column, names), strict=True)]
     return sorted(places, key=lambda place: place.start)
-
-

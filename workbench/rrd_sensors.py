@@ -176,12 +176,15 @@ def _images(batch: pa.RecordBatch) -> Iterator[tuple[int, ImageSample]]:
             (form,) = formats[i]
             data = numbers(buffers[i].values[0].values).tobytes()
             wide = len(data) == 2 * form["width"] * form["height"]
-            yield frame, _image(
+            yield (
                 frame,
-                encoding="mono16" if wide else "mono8",
-                payload=data,
-                width_px=form["width"],
-                height_px=form["height"],
+                _image(
+                    frame,
+                    encoding="mono16" if wide else "mono8",
+                    payload=data,
+                    width_px=form["width"],
+                    height_px=form["height"],
+                ),
             )
 
 

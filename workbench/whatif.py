@@ -12,7 +12,6 @@ import re
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -44,6 +43,7 @@ Table = Mapping[str, Sequence[Any]]
 """Fields of logged steps: one value per frame."""
 
 AGAIN = "replay the recording again"
+GIVE = "give the RUN.rrd of a replay"
 _SELDOM = ("frame", "t_ns", "received_ns", "verdict", "alarms")
 
 
@@ -166,9 +166,9 @@ def open_files(path: Path) -> RunFiles:
             values["run"][key]
         values["settings"]
     except OSError as error:
-        raise RecordingError(file, f"cannot be read ({error.strerror or error})", "give a RUN.rrd of a replay") from error
+        raise RecordingError(file, f"cannot be read ({error.strerror or error})", GIVE) from error
     except (ValueError, KeyError, TypeError) as error:
-        raise RecordingError(file, f"is no RUN.toml of a replay ({error})", "give a RUN.rrd of a replay") from error
+        raise RecordingError(file, f"is no RUN.toml of a replay ({error})", GIVE) from error
     return RunFiles(file.parent, file.stem, values)
 
 
@@ -276,8 +276,10 @@ def _name(run: RunFiles, question: Question) -> str:
     Raises:
         SettingsError: it cannot be a name.
     """
-    words = question.name or "_".join(question.overrides) or (
-        question.settings_file.stem if question.settings_file else "same"
+    words = (
+        question.name
+        or "_".join(question.overrides)
+        or (question.settings_file.stem if question.settings_file else "same")
     )
     name = words if question.name else re.sub(r"[^A-Za-z0-9.]+", "-", words).strip("-.")[:60]
     whole = f"{run.name}.whatif-{name}"
@@ -336,15 +338,13 @@ def _replayed(
     last = sensors.order_of(int(window.frames[window.stop - 1]))
     if window.first == 0:
         samples = sensors.samples(others, -1, last)
-        return [step for _, step in _steps(new, new.start(), samples)], 0
+        return _carried(new, new.start(), samples)[1], 0
     before = int(window.frames[window.first - 1])
     about = {"digest": run.about["digest"], "run": run.name, "estimator": run.about["estimator"]}
     kept = checkpoints.nearest(run.file("checkpoints"), int(window.frames[window.first]), about)
     state = old.unpacked(kept.state, sensors.grey) if isinstance(old, Resumable) else kept.state
     begin, switch = (sensors.order_of(kept.frame) if kept.frame >= 0 else -1), sensors.order_of(before)
-    earlier: list[Step] = []
-    for state, step in _steps(old, state, sensors.samples(others, begin, switch), every=True):
-        earlier += [] if step is None else [step]
+    state, earlier = _carried(old, state, sensors.samples(others, begin, switch))
     _verify(run, earlier)
     if old.settings != new.settings:
         if not isinstance(new, Resumable):
@@ -352,17 +352,17 @@ def _replayed(
                 f"the estimator {new.name!r} cannot go on from a state under other settings: it has no `adopted`"
             )
         state = new.adopted(state)
-    return [step for _, step in _steps(new, state, sensors.samples(others, switch, last))], len(earlier)
+    return _carried(new, state, sensors.samples(others, switch, last))[1], len(earlier)
 
 
-def _steps(
-    estimator: Estimator[Any], state: Any, samples: Iterator[Sample], *, every: bool = False
-) -> Iterator[tuple[Any, Any]]:
-    """The states and steps of some samples; without `every` only where there is a step."""
+def _carried(estimator: Estimator[Any], state: Any, samples: Iterable[Sample]) -> tuple[Any, list[Step]]:
+    """The state after some samples, and the steps on the way."""
+    steps: list[Step] = []
     for sample in samples:
         state, step = stepped(estimator, state, sample)
-        if every or step is not None:
-            yield state, step
+        if step is not None:
+            steps.append(step)
+    return state, steps
 
 
 def _verify(run: RunFiles, steps: Sequence[Step]) -> None:
@@ -520,9 +520,9 @@ def _summary(
     if reference is not None and math.isfinite(last.distance_m):
         offset_ns = round(run.about.get("reference_offset_s", 0.0) * 1e9)
         t_ns = np.array([step.t_ns for step in steps], np.int64) + offset_ns
-        error = partial(_reference_error, t_ns, *reference)
-        found["error_old"] = error(np.array([np.asarray(p) for p in logged["pose"]]))
-        found["error_new"] = error(np.array([step.pose for step in steps]))  # type: ignore[attr-defined]
+        old, new = np.array(logged["pose"]), np.array([getattr(step, "pose") for step in steps])  # noqa: B009
+        found["error_old"] = _reference_error(t_ns, *reference, old)
+        found["error_new"] = _reference_error(t_ns, *reference, new)
     return found
 
 

@@ -160,7 +160,7 @@ class CorrelationOdometry:
         height that the settings give takes the place of the one before.
         """
         s = self._settings
-        given = s.height_m is not None and not s.height_stream
+        height_m = state.height_m if s.height_m is None or s.height_stream else s.height_m
         shift = state.last_shift
         history = self._resized(state)
         return replace(
@@ -168,7 +168,7 @@ class CorrelationOdometry:
             template=None if state.template is None else replace(state.template, fragments=None, tiles=None),
             previous=None if state.previous is None else replace(state.previous, fragments=None, tiles=None),
             last_shift=shift if shift is not None and len(shift) == s.columns * s.rows else None,
-            height_m=s.height_m if given else state.height_m,
+            height_m=height_m,
             history=history,
             usual=state.usual if history is state.history else Usual(*kernels.running_medians(history)),
         )
