@@ -19,6 +19,7 @@ from pipelines.ranging.range_filter import RangeFilter
 from pipelines.ranging.range_settings import RangeSettings
 from pipelines.replay import grey_sample
 from readers.images import RAW_FORMATS
+from pipelines.verdict import Verdict
 from readers.streams import (
     UNKNOWN_QUAT,
     UNKNOWN_VEC3,
@@ -95,7 +96,8 @@ def walk() -> Mission:
     return Mission(list(frames()), {"/camera": StreamKind.IMAGE, "/height": StreamKind.RANGE})
 
 
-COMMON = ("fragment_side_px=24", "focal_px=100", "height_stream='/height'")
+SMALL = ("fragment_side_px=25", "span_u_px=30", "search_radius_px=8")
+COMMON = (*SMALL, "focal_px=100", "height_stream='/height'")
 
 
 @pytest.fixture(autouse=True)
@@ -233,7 +235,7 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(workbench.session, "CHECKPOINT_FRAMES", EVERY)
         runs = {p: replayed(folder, Mission(list(drive()), KINDS), "range", p, *CAMERA) for p in ("best", "paper-b")}
-        joint = (*CAMERA, "mode='joint'", "start='two-views'")
+        joint = (*CAMERA, "mode='joint'")
         runs["joint"] = replayed(folder, Mission(list(drive()), KINDS), "range", "best", *joint, name="joint")
         return runs
 
@@ -242,14 +244,15 @@ def driven(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 def test_ranges_come_out_as_logged(driven: dict[str, Path], preset: str) -> None:
     for start, stop in ((0, 3), (1, 30), (8, 11), (13, 16), (18, 20), (22, 30)):
         same(driven[preset], start, stop)
-    verdicts = [row.old.name for row in same(driven[preset], 0, 30).rows]
-    assert verdicts[12] == "UNDECODABLE"
-    assert verdicts[17] == "DUPLICATE_FRAME"
-    assert verdicts[21] == "OUT_OF_ORDER"
+    alarms = [step.alarms for step in same(driven[preset], 0, 30).steps]
+    assert Verdict.UNDECODABLE in alarms[12]
+    assert Verdict.DUPLICATE_FRAME in alarms[17]
+    assert Verdict.OUT_OF_ORDER in alarms[21]
+    assert Verdict.INPUT_UNREADABLE in alarms[14]
 
 
 def test_ranges_with_other_settings(driven: dict[str, Path]) -> None:
-    answer = ask(Question(run=driven["best"], start="15", stop="25", overrides=("pixel_sigma=3.0",)))
+    answer = ask(Question(run=driven["best"], start="15", stop="25", overrides=("tracks.sigma_px=3.0",)))
     assert 0 < answer.summary["end_range_share"] < 1
     assert np.isnan(answer.rows[0].distance_m)
 
@@ -333,7 +336,7 @@ def test_stride_and_window_keep_their_numbers(tmp_path: Path) -> None:
 
 def test_a_later_run_adds_its_streams_and_takes_none_away(tmp_path: Path) -> None:
     replayed(tmp_path, walk(), "correlation", "best", *COMMON)
-    constant = ("fragment_side_px=24", "metres_per_px=0.01")
+    constant = (*SMALL, "metres_per_px=0.01")
     later = replayed(tmp_path, walk(), "correlation", "best", *constant, name="later")
     same(tmp_path / "best.rrd", 12, 16)
     same(later, 12, 16)

@@ -168,7 +168,7 @@ def _images(batch: pa.RecordBatch) -> Iterator[tuple[int, ImageSample]]:
     elif f"{ARCHETYPE}:grey" in names:
         greys = batch.column(f"{ARCHETYPE}:grey")
         for i, frame in enumerate(frames):
-            data = numbers(greys[i].values[0].values).tobytes()
+            data = numbers(greys[i].values).tobytes()
             yield frame, _image(frame, encoding="png", payload=data)
     elif "Image:buffer" in names:
         buffers, formats = batch.column("Image:buffer"), batch.column("Image:format").to_pylist()
