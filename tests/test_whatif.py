@@ -18,8 +18,8 @@ from pipelines.estimator import EstimatorError
 from pipelines.ranging.range_filter import RangeFilter
 from pipelines.ranging.range_settings import RangeSettings
 from pipelines.replay import grey_sample
-from readers.images import RAW_FORMATS
 from pipelines.verdict import Verdict
+from readers.images import RAW_FORMATS
 from readers.streams import (
     UNKNOWN_QUAT,
     UNKNOWN_VEC3,

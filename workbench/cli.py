@@ -811,8 +811,8 @@ def settings(
     short_help="Replay a window of a run with other settings, old against new.",
     epilog=_examples(
         "workbench whatif results/mission/best.rrd --from 1200 --to 1300 --set search_radius_px=48",
-        "workbench whatif results/mission --from 12.5s --to 20s --set min_peak_ratio=1.1 --fields peak_ratio",
-        "workbench whatif results/mission --from 1200 --to 1300 --set prediction=zero --open",
+        "workbench whatif results/mission --from 12.5s --to 20s --set max_peak_ratio=0.8 --fields peak_ratio",
+        "workbench whatif results/mission --from 1200 --to 1300 --set prediction=last-shift --open",
     ),
 )
 def what_if(

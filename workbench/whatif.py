@@ -565,8 +565,8 @@ def _differences(old: BaseModel, new: BaseModel) -> dict[str, list[Any]]:
 
 # --------------------------------------------------------------------------- for reading
 
-_MOST = 2
-"""So many of a frame's changed fields stand in the table."""
+_WIDTH = 60
+"""Of a frame's changed fields so many stand in the table as go into this width."""
 
 
 def cells(answer: Answer) -> tuple[list[str], list[list[str]]]:
@@ -581,9 +581,19 @@ def cells(answer: Answer) -> tuple[list[str], list[list[str]]]:
         shown += [_metres(row.distance_m), _degrees(row.turn_rad)] if path else [_share(row.range_share)]
         for name in answer.fields:
             shown.append(f"{_value(answer.logged[name][places[row.frame]])} → {_value(getattr(step, name))}")
-        most = "  ".join(f"{c.field} {c.old:.4g} → {c.new:.4g}" for c in row.changes[:_MOST])
-        rows.append([str(row.frame), *shown, "" if answer.fields else most or "nothing"])
+        rows.append([str(row.frame), *shown, "" if answer.fields else _most(row.changes)])
     return heads, rows
+
+
+def _most(changes: Sequence[Change]) -> str:
+    """The fields that changed most."""
+    said = ""
+    for change in changes:
+        longer = f"{said}{', ' if said else ''}{change.field} {change.old:.4g} → {change.new:.4g}"
+        if said and len(longer) > _WIDTH:
+            break
+        said = longer
+    return said or "nothing"
 
 
 def summary_lines(answer: Answer) -> list[str]:
