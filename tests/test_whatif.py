@@ -160,6 +160,9 @@ def test_other_settings_go_on_from_the_old_state(walked: dict[str, Path]) -> Non
     for frame in (13, 14, 17, 30 - 1):  # at twice the height a pixel is twice as wide, to the height's own wobble
         assert steps[frame].path_step_m == pytest.approx(logged[frame] * (1 + 1 / (1 + 0.01 * np.sin(frame))), rel=1e-9)
     assert answer.rows[-1].distance_m > 0.1
+    height = next(change for change in answer.rows[3].changes if change.field == "height_m")
+    assert height.new - height.old == pytest.approx(1.0)
+    assert all(change.field != "height_offset_m" for row in answer.rows for change in row.changes)
     before = ask(Question(run=walked["best"], start="11", stop="12")).steps[0]
     gap = np.hypot(*(steps[12].pose[:2] - before.pose[:2]))
     assert gap == pytest.approx(steps[12].path_step_m, rel=1e-9)  # from where the run was, not from its start

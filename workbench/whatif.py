@@ -10,7 +10,7 @@ from __future__ import annotations
 import math
 import re
 import tomllib
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -217,9 +217,10 @@ def ask(question: Question) -> Answer:
         steps, verified = _replayed(run, sensors, window, old, new)
         reference = _reference(run, window)
     logged = _logged(run, window, new.step_type)
-    rows = tuple(_rows(logged, steps))
+    settled = _differences(old_settings, new_settings)
+    rows = tuple(_rows(logged, steps, settled))
     summary = _summary(run, name, window, rows, steps, logged, reference, verified)
-    summary |= {"changed_settings": _differences(old_settings, new_settings)}
+    summary |= {"changed_settings": settled}
     return Answer(run, name, new, rows, tuple(steps), logged, question.fields, summary)
 
 
@@ -419,10 +420,10 @@ def _reference(run: RunFiles, window: Window) -> Any:
 # ---------------------------------------------------------------------------- comparison
 
 
-def _rows(logged: Table, steps: Sequence[Step]) -> Iterator[Row]:
-    """Each frame, old against new."""
+def _rows(logged: Table, steps: Sequence[Step], settled: Container[str] = ()) -> Iterator[Row]:
+    """Each frame, old against new; fields that repeat a changed setting are no news."""
     places = {frame: i for i, frame in enumerate(logged["frame"])}
-    fields = [name for name in logged if name not in _SELDOM]
+    fields = [name for name in logged if name not in _SELDOM and name not in settled]
     usual = {name: _size(logged[name]) for name in fields}
     for step in steps:
         i = places.get(step.frame)
@@ -458,13 +459,13 @@ def _change(name: str, old: Any, new: Any, usual: float) -> Change | None:
         return Change(f"{name}: shape", float(a.size), float(b.size), math.inf)
     if a.tobytes() == b.tobytes():
         return None
-    differs = a.view(np.int64).ravel() != b.view(np.int64).ravel() if a.ndim else np.array([True])
+    differs = a.view(np.int64).ravel() != b.view(np.int64).ravel()
     with np.errstate(invalid="ignore"):
         size = np.abs(b - a).ravel() / usual
     one_sided = np.isnan(a).ravel() != np.isnan(b).ravel()
     size = np.where(differs, np.where(one_sided, 1.0, np.nan_to_num(size, nan=0.0, posinf=np.inf)), -1.0)
     at = int(size.argmax())
-    index = ",".join(map(str, np.unravel_index(at, a.shape))) if a.ndim else ""
+    index = ",".join(map(str, np.unravel_index(at, a.shape))) if np.ndim(old) else ""
     return Change(f"{name}[{index}]" if index else name, float(a.ravel()[at]), float(b.ravel()[at]), float(size[at]))
 
 
@@ -518,11 +519,12 @@ def _summary(
     if shares:
         found |= {"end_range_share": last.range_share, "median_range_share": float(np.median(shares))}
     if reference is not None and math.isfinite(last.distance_m):
+        at_ns, truth = reference
         offset_ns = round(run.about.get("reference_offset_s", 0.0) * 1e9)
         t_ns = np.array([step.t_ns for step in steps], np.int64) + offset_ns
         old, new = np.array(logged["pose"]), np.array([getattr(step, "pose") for step in steps])  # noqa: B009
-        found["error_old"] = _reference_error(t_ns, *reference, old)
-        found["error_new"] = _reference_error(t_ns, *reference, new)
+        found["error_old"] = _reference_error(t_ns, at_ns, truth, old)
+        found["error_new"] = _reference_error(t_ns, at_ns, truth, new)
     return found
 
 
