@@ -11,7 +11,6 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.special import gammaincinv
 
 Floats = NDArray[np.float64]
 
@@ -60,6 +59,8 @@ def band(degrees: int, samples: int, confidence: float = 0.95) -> tuple[float, f
     if not samples:
         return math.nan, math.nan
     tail = (1.0 - confidence) / 2
+    from scipy.special import gammaincinv  # late: it loads slowly, and many who import this need no band
+
     # the quantile of χ² with k degrees is twice that of the gamma distribution of shape k/2; scipy.stats loads slowly
     low, high = (2 * float(gammaincinv(degrees * samples / 2, p)) / samples for p in (tail, 1.0 - tail))
     return low, high

@@ -8,10 +8,12 @@ is one field there and one row in `workbench/schema.py`.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from typing import Any, ClassVar, Protocol, TypeVar
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeVar, runtime_checkable
 
+import numpy as np
+from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from pipelines.verdict import Verdict
@@ -73,6 +75,47 @@ class Estimator(Protocol[StateT]):
 
     def step(self, state: StateT, sample: Sample, /) -> tuple[StateT, Step | None]:
         """Take one sample; return the new state, and a Step where the sample was a frame."""
+        ...
+
+
+class FrameImage(NamedTuple):
+    """Stands in a packed state for the decoded grey image of a frame, which the recording holds anyway."""
+
+    frame: int
+
+
+Images = Callable[[int], NDArray[np.uint8] | NDArray[np.uint16]]
+"""Grey levels [height, width] of the image of a frame, by its number."""
+
+
+@runtime_checkable
+class Resumable(Protocol[StateT]):
+    """What an estimator may offer beside `Estimator`, so that a replay can go on from the middle.
+
+    A packed state is a value of frozen dataclasses, named tuples, arrays, enums, containers and numbers. An
+    estimator without these methods has its states kept as they are, and cannot go on under other settings.
+    """
+
+    def packed(self, state: StateT, /) -> Any:
+        """The state in a form that is small to keep: images of frames as `FrameImage`, no settings."""
+        ...
+
+    def unpacked(self, packed: Any, images: Images, /) -> StateT:
+        """The state that was packed: every step from it is, bit for bit, the step from the state itself.
+
+        Raises:
+            EstimatorError: it is no state of this estimator under its settings.
+        """
+        ...
+
+    def adopted(self, state: StateT, /) -> StateT:
+        """The state of the same estimator under other settings, in the shape that these settings need.
+
+        What was computed stays as far as it fits; what does not fit begins afresh.
+
+        Raises:
+            EstimatorError: the states do not match; the text names the setting and the cure.
+        """
         ...
 
 

@@ -44,6 +44,13 @@ class LatencyBuffer:
         if self.wait_ns < 0:
             raise ValueError(f"wait_ns must be 0 or more, not {self.wait_ns}")
 
+    @property
+    def order(self) -> str:
+        """In what order the samples come out, in words that are equal for equal orders."""
+        late = ", ".join(f"{stream} {ns} ns late" for stream, ns in sorted(self.delay_ns.items()) if ns)
+        parts = [f"{'arrival' if self.by_arrival else 'stamps'}, held for {self.wait_ns} ns", late]
+        return "; ".join(part for part in (*parts, "frames look ahead" if self.look_ahead else "") if part)
+
     def through(self, samples: Iterable[Sample], inputs: Collection[str] = ()) -> Iterator[Sample]:
         """Give the samples on, by time; an error of the reader comes after all that came before it.
 

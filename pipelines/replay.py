@@ -40,6 +40,9 @@ Frame = ImageSample | TrackSample | LandmarkSample | Problem
 
 OnProgress = Callable[[int, int], None]
 
+OnSample = Callable[[Sample, Sample, Any, Step | None], None]
+"""Told after every sample: as it was stored, as the estimator got it, the state after it, and its Step if any."""
+
 
 @dataclass(frozen=True, slots=True)
 class Replayed:
@@ -68,6 +71,8 @@ def replay(
     latency: LatencyBuffer | None = None,
     decode_ahead: int = 4,
     on_progress: OnProgress | None = None,
+    beside_streams: Sequence[str] = (),
+    on_sample: OnSample | None = None,
 ) -> Generator[Replayed]:
     """Run an estimator over a recording, as fast as it goes; yield every step with its frame.
 
@@ -88,6 +93,8 @@ def replay(
         latency: a buffer that sorts the samples by time; None: they come as the reader sorts them.
         decode_ahead: how many images are decoded ahead of the estimator.
         on_progress: called after each step with the number of steps so far and the frame's time in ns.
+        beside_streams: names of streams that only `on_sample` gets; with the state as it is by then.
+        on_sample: called after each sample but those that are only shown, in the order in which they came.
 
     Raises:
         ValueError: `stride` or `decode_ahead` is below 1.
@@ -97,7 +104,8 @@ def replay(
     if stride < 1 or decode_ahead < 1:
         raise ValueError(f"stride and decode_ahead must be 1 or more, not {stride} and {decode_ahead}")
     shown = [shown_stream] if shown_stream and shown_stream != image_stream else []
-    names = [image_stream, *other_streams, *shown]
+    beside = [name for name in beside_streams if name not in (image_stream, *other_streams, *shown)]
+    names = [image_stream, *other_streams, *shown, *beside]
     for name in names:
         recording.stream(name)
     first = 0 if start_ns is None else recording.count_before(image_stream, start_ns)
@@ -106,7 +114,8 @@ def replay(
     else:
         samples = latency.through(_unsorted(recording, names, start_ns, stop_ns, latency.by_arrival), other_streams)
     chosen = _numbered(samples, image_stream, first, stride)
-    steps = _steps(_decoded_ahead(chosen, decode_ahead, shown), estimator, image_stream, shown)
+    ahead = _decoded_ahead(chosen, decode_ahead, [*shown, *beside])
+    steps = _steps(ahead, estimator, image_stream, shown, beside, on_sample)
     return _told(_with_shown(steps) if shown else steps, on_progress)
 
 
@@ -124,7 +133,12 @@ def _unsorted(
 
 
 def _steps(
-    samples: Generator[tuple[Sample, Sample]], estimator: Estimator[Any], frames: str, shown: Sequence[str]
+    samples: Generator[tuple[Sample, Sample]],
+    estimator: Estimator[Any],
+    frames: str,
+    shown: Sequence[str],
+    beside: Sequence[str],
+    on_sample: OnSample | None,
 ) -> Generator[Replayed | ImageSample | Problem]:
     """Give every decoded sample to the estimator; yield the frames' steps, and the images that are only shown."""
     state = estimator.start()
@@ -134,14 +148,23 @@ def _steps(
                 if isinstance(original, ImageSample | Problem):
                     yield original
                 continue
-            try:
-                state, step = estimator.step(state, decoded)
-            except Exception as error:
-                error.add_note(_where(decoded))
-                raise
+            step = None
+            if original.stream not in beside:
+                state, step = stepped(estimator, state, decoded)
+            if on_sample is not None:
+                on_sample(original, decoded, state, step)
             frame = decoded if isinstance(decoded, Problem) else original
             if step is not None and frame.stream == frames and isinstance(frame, Frame):
                 yield Replayed(frame, step)
+
+
+def stepped(estimator: Estimator[Any], state: Any, sample: Sample) -> tuple[Any, Step | None]:
+    """Give a sample to an estimator; an error of it has a note that says at which."""
+    try:
+        return estimator.step(state, sample)
+    except Exception as error:
+        error.add_note(_where(sample))
+        raise
 
 
 def _with_shown(steps: Generator[Replayed | ImageSample | Problem]) -> Generator[Replayed]:

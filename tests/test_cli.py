@@ -98,6 +98,7 @@ def test_a_replay_leaves_a_run_folder_and_a_summary(toys: Path, shell: Shell) ->
     assert said.status == 0
     folder = toys / "results" / "walk-camera"
     assert sorted(p.name for p in folder.iterdir()) == [
+        "best.checkpoints",
         "best.rrd",
         "best.toml",
         "best.tum",

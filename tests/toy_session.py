@@ -141,6 +141,9 @@ class ToySensors(TextLog):
     def image(self, frame: int, sample: ImageSample) -> None:
         self._say("image", frame, sample.t_ns, bytes(sample.data).hex())
 
+    def sample(self, original: Sample, decoded: Sample) -> None:
+        self._say("sample", original.stream, original.t_ns)
+
     def undecodable(self, frame: int, t_ns: int, reason: str) -> None:
         self._say("undecodable", frame, t_ns, reason)
 

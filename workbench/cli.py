@@ -807,6 +807,80 @@ def settings(
         print(to_toml({key: values[key]}).strip() if values[key] is not None else f"# {key} is not set")
 
 
+# -------------------------------------------------------------------------------- whatif
+
+
+@app.command(
+    "whatif",
+    short_help="Replay a window of a run with other settings, old against new.",
+    epilog=examples(
+        "workbench whatif results/mission/best.rrd --from 1200 --to 1300 --set search_radius_px=48",
+        "workbench whatif results/mission --from 12.5s --to 20s --set max_peak_ratio=0.8 --fields peak_ratio",
+        "workbench whatif results/mission --from 1200 --to 1300 --set prediction=last-shift --open",
+    ),
+)
+def what_if(
+    run: Annotated[
+        Path,
+        typer.Argument(metavar="RUN", help="RUN.rrd of a replay, or a folder with one run", show_default=False),
+    ],
+    start: Annotated[
+        str | None,
+        typer.Option("--from", metavar="A", help="First frame: its number (120) or a time (12.5s, ns, ISO 8601)."),
+    ] = None,
+    stop: Annotated[str | None, typer.Option("--to", metavar="B", help="Frame or time to end before.")] = None,
+    overrides: Annotated[
+        list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting to change; repeatable.")
+    ] = None,
+    settings_file: Annotated[
+        Path | None, typer.Option("--settings", metavar="FILE", help="Settings to change, TOML or JSON.")
+    ] = None,
+    name: Annotated[
+        str | None, typer.Option("--name", help="Name of the answer: RUN.whatif-NAME.rrd; made of the settings else.")
+    ] = None,
+    fields: Annotated[
+        str | None, typer.Option("--fields", metavar="A,B", help="Fields of the steps to show, old and new.")
+    ] = None,
+    as_json: AsJson = False,
+    open_: Annotated[bool, typer.Option("--open", help="Open old and new in the viewer.")] = False,
+) -> None:
+    """Replay a window of a run from the state that it had then, with other settings; show old against new.
+
+    The recording is not needed: states and samples lie in the run's folder. A plain number is a frame's.
+    """
+    from workbench.whatif import Question, ask, cells, summary_lines, values_of, write
+
+    chosen = [field.strip() for field in (fields or "").split(",") if field.strip()]
+    answer = ask(
+        Question(
+            run=run,
+            start=start,
+            stop=stop,
+            overrides=tuple(overrides or ()),
+            settings_file=settings_file,
+            name=name,
+            fields=tuple(chosen),
+        )
+    )
+    if as_json:
+        print_json(values_of(answer))
+    else:
+        heads, rows = cells(answer)
+        print("\n".join(table(heads, rows, right=range(2))), end="\n\n")
+        for line in summary_lines(answer):
+            print(shown(line))
+    sys.stdout.flush()  # the table is the answer; the recording comes after it
+    write(answer)
+    if open_:
+        command = view_command(answer.files, web=False)
+        if not has_display():
+            import shlex
+
+            print(shlex.join(["rerun", *command[3:]]), file=sys.stderr)
+            return
+        raise typer.Exit(subprocess.run(command, check=False).returncode)
+
+
 # -------------------------------------------------------------------------------- helpers
 
 

@@ -30,7 +30,7 @@ from pipelines.estimator import Step
 from pipelines.geometry import heading_of_quat
 from pipelines.ranging.step import RangeStep
 from pipelines.verdict import Severity, Verdict
-from readers.streams import ImageError, ImageSample, PoseSample, RecordingError
+from readers.streams import ImageError, ImageSample, PoseSample, RecordingError, Sample
 from workbench import traces
 from workbench.blueprints import Bounds, Extent, blueprint_of, sensor_blueprint
 from workbench.rrd_correlation import CorrelationDrawing
@@ -47,12 +47,14 @@ from workbench.rrd_file import (
     document,
     flat,
     marker,
+    numbers,
     texts,
 )
 from workbench.rrd_ranges import RangeDrawing
 from workbench.rrd_reading import around, chunks
 from workbench.rrd_reading import merge as merge
 from workbench.rrd_reading import recover as recover
+from workbench.rrd_samples import SampleLog, is_grey
 from workbench.schema import Archetype, Row, Schema, schema_of
 
 if TYPE_CHECKING:
@@ -60,6 +62,7 @@ if TYPE_CHECKING:
 
 MAX_ROWS = 1024
 MAX_BYTES = 2 << 20
+MAX_SAMPLES = 8192
 MAX_AGE_S = 0.5
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -140,6 +143,7 @@ class SensorWriter(_Writer):
         self._pixels: list[tuple[int, int, NDArray[Any]]] = []
         self._frames: list[tuple[int, int]] = []
         self._bytes = 0
+        self._samples = SampleLog(self._file)
         self._reference: tuple[Ints, Floats, Floats] | None = None
         self._arrow_m = 1.0
 
@@ -152,7 +156,7 @@ class SensorWriter(_Writer):
         if sample.media_type is not None:
             self._encoded(frame, sample.t_ns, sample.data, sample.media_type)
         else:
-            pixels = sample.grey() if _is_grey(sample.encoding) else sample.colour()
+            pixels = sample.grey() if is_grey(sample.encoding) else sample.colour()
             if self._raw_images == "raw":
                 self._pixels.append((frame, sample.t_ns, pixels))
                 self._bytes += pixels.nbytes
@@ -160,6 +164,11 @@ class SensorWriter(_Writer):
                 self._encoded(frame, sample.t_ns, _png(pixels, sample), "image/png")
         self._frames.append((frame, sample.t_ns))
         self._flush_if(self._bytes > MAX_BYTES or len(self._frames) >= MAX_ROWS)
+
+    def sample(self, original: Sample, decoded: Sample) -> None:
+        """Log the next sample in the order of arrival, as it was stored and as the estimator got it."""
+        self._samples.add(original, decoded)
+        self._flush_if(self._samples.bytes > MAX_BYTES or len(self._samples) >= MAX_SAMPLES)
 
     def undecodable(self, frame: int, t_ns: int, reason: str) -> None:
         """Log that a frame has no image, and why; the viewer then shows none."""
@@ -200,6 +209,7 @@ class SensorWriter(_Writer):
         self._bytes += len(data)
 
     def _write(self) -> None:
+        self._samples.write()
         if self._images:
             frames, t_ns, data, media = zip(*self._images, strict=True)
             columns = rr.EncodedImage.columns(blob=blobs(data), media_type=list(media))
@@ -223,10 +233,6 @@ class SensorWriter(_Writer):
         good = np.isfinite(vectors).all(axis=1)
         arrows = rr.Arrows3D.columns(vectors=vectors[good], origins=points[good])
         self._file.send(f"{REFERENCE}/heading", frames[good], t_ns[good], arrows)
-
-
-def _is_grey(encoding: str) -> bool:
-    return encoding.lower().startswith(("mono", "8uc1", "16uc1"))
 
 
 def _png(pixels: NDArray[Any], sample: ImageSample) -> bytes:
@@ -469,8 +475,8 @@ def read_fields(
     components = sorted({row.component for row in needed if row.component} | {_FORMAT})
     parts = chunks(Path(path), f"/runs/{run}/**", components=components)
     rows = _whole_rows(parts if frames is None else around(parts, frames), needed, frames)
-    numbers, t_ns, _ = next(iter(rows.values()))
-    if not len(numbers):
+    logged, t_ns, _ = next(iter(rows.values()))
+    if not len(logged):
         some = "" if frames is None else f" from frame {frames.start} to before {frames.stop}"
         raise RecordingError(path, f"holds no steps of a run named {run!r}{some}", "name a run of this file")
     table: dict[str, Sequence[Any]] = {}
@@ -479,7 +485,7 @@ def read_fields(
             table |= _split(schema, group, rows[entity, group[0].component][2])
     for row in needed:
         if row.archetype is Archetype.TIMELINE:
-            table[row.field] = {"frame": numbers, "sensor_time": t_ns}[row.entity].tolist()
+            table[row.field] = {"frame": logged, "sensor_time": t_ns}[row.entity].tolist()
         elif row.archetype is Archetype.INTEGERS:
             table[row.field] = [int(value[0]) for value in rows[row.entity, row.component][2]]
         elif row.archetype is Archetype.SURFACES:
@@ -535,12 +541,12 @@ def _whole_rows(
             continue
         batch = chunk.to_record_batch()
         if wanted is not None:
-            numbers = batch.column("frame").to_numpy()
-            batch = batch.filter(pa.array((numbers >= wanted.start) & (numbers < wanted.stop)))
+            frames = numbers(batch.column("frame"))
+            batch = batch.filter(pa.array((frames >= wanted.start) & (frames < wanted.stop)))
         for component in batch.schema.names:
             if batch.num_rows and (entity, component) in parts:
-                frames = batch.column("frame").to_numpy()
-                t_ns = batch.column("sensor_time").to_numpy().astype(np.int64)
+                frames = numbers(batch.column("frame"))
+                t_ns = numbers(batch.column("sensor_time"))
                 parts[entity, component].append((frames, t_ns, _lists(batch.column(component))))
     whole = functools.reduce(np.intersect1d, (_concatenated(part)[0] for part in parts.values()))
     return {key: _only(whole, *_concatenated(part)) for key, part in parts.items()}
@@ -595,7 +601,7 @@ def _lists(column: pa.ListArray) -> list[Any]:
     if not (pa.types.is_integer(kind) or pa.types.is_floating(kind)):
         return list(column.to_pylist())
     bounds = np.cumsum([0, *column.value_lengths().to_pylist()])
-    flat = column.flatten().to_numpy(zero_copy_only=False)
+    flat = numbers(column.flatten())
     return [flat[a:b] for a, b in itertools.pairwise(bounds)]
 
 

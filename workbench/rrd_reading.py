@@ -20,6 +20,7 @@ from numpy.typing import NDArray
 from rerun.chunk import RrdReader
 
 from readers.streams import RecordingError
+from workbench.rrd_file import numbers
 from workbench.schema import Archetype, Row, Schema
 
 Ints = NDArray[np.int64]
@@ -98,9 +99,9 @@ def _joined(parts: Iterable[Any], component: str) -> Series:
         batch = chunk.to_record_batch()
         if component not in batch.schema.names:
             continue
-        times.append(batch.column("sensor_time").to_numpy().astype(np.int64))
+        times.append(numbers(batch.column("sensor_time")))
         named = "frame" in batch.schema.names
-        frames.append(batch.column("frame").to_numpy() if named else np.full(len(times[-1]), -1))
+        frames.append(numbers(batch.column("frame")) if named else np.full(len(times[-1]), -1))
         values.append(_rows(batch.column(component)))
     if not times:
         return Series(np.zeros(0, np.int64), np.zeros(0, np.int64), np.zeros((0, 0)))
@@ -113,15 +114,14 @@ def _joined(parts: Iterable[Any], component: str) -> Series:
 
 def _rows(column: pa.ListArray) -> NDArray[Any]:
     """The rows of an Arrow column of lists: [n, k] of numbers where all are equally long, else [n] of arrays."""
-    lengths = column.value_lengths().to_numpy(zero_copy_only=False)
+    lengths = numbers(column.value_lengths())
     flat = column.flatten()
     if not (pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)):
         return _objects(column.to_pylist())
-    numbers = flat.to_numpy(zero_copy_only=False)
+    values = numbers(flat)
     if len(lengths) and (lengths == lengths[0]).all():
-        table: NDArray[Any] = numbers.reshape(len(lengths), int(lengths[0]))
-        return table
-    return _objects(np.split(numbers, np.cumsum(lengths)[:-1]))
+        return values.reshape(len(lengths), int(lengths[0]))
+    return _objects(np.split(values, np.cumsum(lengths)[:-1]))
 
 
 def _objects(items: Sequence[Any]) -> NDArray[Any]:
@@ -212,8 +212,8 @@ def _split(schema: Schema, rows: Sequence[Row], values: NDArray[Any]) -> dict[st
 def _filled(values: NDArray[Any]) -> Floats:
     """Rows of different lengths as one array, NaN behind the shorter ones."""
     filled = np.full((len(values), max(map(len, values))), np.nan)
-    for row, numbers in zip(filled, values, strict=True):
-        row[: len(numbers)] = numbers
+    for row, known in zip(filled, values, strict=True):
+        row[: len(known)] = known
     return filled
 
 
@@ -225,7 +225,7 @@ def stored_image(path: Path, entity: str, frame: int) -> Mapping[str, Any] | Non
     """
     for chunk in around(chunks(path, entity), range(frame, frame + 1)):
         batch = chunk.to_record_batch()
-        at = np.flatnonzero(batch.column("frame").to_numpy() == frame)
+        at = np.flatnonzero(numbers(batch.column("frame")) == frame)
         if len(at):
             row = batch.slice(int(at[0]), 1)
             found = {name: row.column(name)[0].as_py() for name in row.schema.names if ":" in name}

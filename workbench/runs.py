@@ -18,13 +18,14 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from numpy.typing import NDArray
+from pydantic import BaseModel
 
 from pipelines.estimator import Step
 from pipelines.evaluation import Trajectory
 from pipelines.verdict import Verdict
 from readers.streams import ImageSample, RecordingError
 from workbench.schema import Archetype, Schema, schema_of
-from workbench.settings import Plugin, plugin, settings_values
+from workbench.settings import Layer, Plugin, plugin, settings_values, validated
 
 if TYPE_CHECKING:
     import pandas as pd
@@ -32,6 +33,8 @@ if TYPE_CHECKING:
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
 IMAGE = "/camera/image"
+ANSWER = ".whatif-"
+"""What the names of the answers of ``whatif`` hold."""
 CURE = "give the RUN.rrd, the RUN.toml or the folder of a replay"
 
 
@@ -64,10 +67,14 @@ class Run:
 
     # ---- files
 
+    def path(self, ending: str) -> Path:
+        """One of the run's own files, such as ``RUN.tum``."""
+        return self.folder / f"{self.name}.{ending}"
+
     @property
     def file(self) -> Path:
         """RUN.rrd."""
-        return self.folder / f"{self.name}.rrd"
+        return self.path("rrd")
 
     @property
     def sensors_file(self) -> Path:
@@ -77,19 +84,25 @@ class Run:
     # ---- what was asked for
 
     @property
+    def about(self) -> Mapping[str, Any]:
+        """The table ``run`` of RUN.toml."""
+        values: Mapping[str, Any] = self.toml["run"]
+        return values
+
+    @property
     def estimator(self) -> str:
         """Name of the estimator."""
-        return str(self.toml["run"]["estimator"])
+        return str(self.about["estimator"])
 
     @property
     def preset(self) -> str:
         """Name of the preset that the settings started from."""
-        return str(self.toml["run"]["preset"])
+        return str(self.about["preset"])
 
     @property
     def digest(self) -> str:
         """SHA-256 of the recording; equal for runs of one mission."""
-        return str(self.toml["run"]["digest"])
+        return str(self.about["digest"])
 
     @property
     def settings(self) -> Mapping[str, Any]:
@@ -117,6 +130,17 @@ class Run:
         """
         return plugin(self.estimator)
 
+    @functools.cached_property
+    def model(self) -> BaseModel:
+        """The settings as they were; a key that is missing was None, as TOML has no word for it.
+
+        Raises:
+            SettingsError: the estimator of this version does not have them.
+        """
+        settings = self.plugin.settings
+        base = settings.model_construct(**dict.fromkeys(settings.model_fields))
+        return validated(base, [Layer(str(self.path("toml")), _with_none(settings, self.settings))]).settings
+
     def changed_settings(self) -> dict[str, tuple[Any, Any]]:
         """The settings that differ from their preset's: name → value here, value there (None: not set)."""
         usual = _without_none(settings_values(self.plugin.preset(self.preset)))
@@ -129,8 +153,7 @@ class Run:
     @functools.cached_property
     def schema(self) -> Schema:
         """Where each field of its steps lies."""
-        estimator = self.plugin.build(self.plugin.settings.model_validate(self.settings))
-        return schema_of(estimator.step_type)
+        return schema_of(self.plugin.step_type(self.model))
 
     @property
     def step_type(self) -> type[Step]:
@@ -282,7 +305,7 @@ class Run:
         if row is None:
             return None
         t_ns = int(self.t_ns[self.row_of(frame)])
-        return _sample(row, frame, t_ns, self.toml["run"]["image_stream"], str(self.sensors_file))
+        return _sample(row, frame, t_ns, self.about["image_stream"], str(self.sensors_file))
 
 
 def open_run(path: Path | str) -> Run:
@@ -293,7 +316,7 @@ def open_run(path: Path | str) -> Run:
     """
     path = Path(path)
     if path.is_dir():
-        found = sorted(file for file in path.glob("*.toml") if file.name != "sensors.toml")
+        found = _replays_in(path)
         if len(found) > 1:
             names = ", ".join(file.stem for file in found)
             raise RecordingError(
@@ -314,10 +337,15 @@ def runs_in(paths: Iterable[Path | str]) -> list[Run]:
     """
     found: list[Run] = []
     for path in map(Path, paths):
-        files = sorted(path.glob("*.toml")) if path.is_dir() else []
-        files = [file for file in files if file.name != "sensors.toml"]
+        files = _replays_in(path) if path.is_dir() else []
         found += [_opened(file) for file in files] or [open_run(path)]
     return found
+
+
+def _replays_in(folder: Path) -> list[Path]:
+    """The RUN.toml of every replay in a folder; answers of ``whatif`` are asked for by their names."""
+    names = sorted(file for file in folder.glob("*.toml") if file.name != "sensors.toml")
+    return [file for file in names if ANSWER not in file.stem]
 
 
 def _opened(file: Path) -> Run:
@@ -327,12 +355,22 @@ def _opened(file: Path) -> Run:
         raise RecordingError(file.with_suffix(""), "there is no such run", CURE) from None
     except (OSError, tomllib.TOMLDecodeError, UnicodeDecodeError) as error:
         raise RecordingError(file, f"cannot be read ({error})", "replay the recording again") from error
-    if not {"name", "estimator", "preset", "digest"} <= set(values.get("run", {})):
+    if not {"name", "estimator", "preset", "digest", "image_stream"} <= set(values.get("run", {})):
         raise RecordingError(file, "is not the RUN.toml of a replay", CURE)
     run = Run(file.parent, str(values["run"]["name"]), values)
     if not run.file.is_file():
         raise RecordingError(run.file, "is missing beside its RUN.toml", "replay the recording again")
     return run
+
+
+def _with_none(model: type[BaseModel], values: Mapping[str, Any]) -> dict[str, Any]:
+    """Values from TOML with None for every key that is missing."""
+    found: dict[str, Any] = {}
+    for name, info in model.model_fields.items():
+        value, inner = values.get(name), info.annotation
+        nested = isinstance(inner, type) and issubclass(inner, BaseModel) and isinstance(value, dict)
+        found[name] = _with_none(inner, value) if nested else value  # type: ignore[arg-type]
+    return found
 
 
 def _without_none(values: Mapping[str, Any]) -> dict[str, Any]:

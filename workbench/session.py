@@ -9,6 +9,7 @@ RUN.toml says so. Nothing of the wall clock goes into the files.
 from __future__ import annotations
 
 import contextlib
+import functools
 import importlib.metadata
 import math
 import platform
@@ -26,7 +27,7 @@ from typing import Any, NamedTuple, Protocol, Self, TextIO
 
 import numpy as np
 
-from pipelines.estimator import Estimator, Step
+from pipelines.estimator import Estimator, Resumable, Step
 from pipelines.evaluation import Evaluation, EvaluationError, Trajectory, evaluate, mean_angle, path_lengths
 from pipelines.geometry import Floats, wrap_angle
 from pipelines.latency import LatencyBuffer
@@ -46,6 +47,7 @@ from readers.streams import (
     StreamInfo,
 )
 from workbench import inputs, range_inputs
+from workbench.checkpoints import CHECKPOINT_FRAMES, CheckpointError, CheckpointWriter
 from workbench.range_account import RangeAccount
 from workbench.range_smoothing import Smoothing
 from workbench.settings import Plugin, Resolved, SettingsError, plugin, resolve, settings_values, to_toml
@@ -119,6 +121,7 @@ class SensorLog(Protocol):
     """What the session needs of `workbench.rrd.SensorWriter`."""
 
     def image(self, frame: int, sample: ImageSample) -> None: ...  # noqa: D102
+    def sample(self, original: Sample, decoded: Sample) -> None: ...  # noqa: D102
     def undecodable(self, frame: int, t_ns: int, reason: str) -> None: ...  # noqa: D102
     def reference(self, poses: Sequence[PoseSample]) -> None: ...  # noqa: D102
     def facts(self, lines: Sequence[str]) -> None: ...  # noqa: D102
@@ -538,6 +541,42 @@ class _PathAccount:
         return calibration(self._settings, evaluation)
 
 
+class _Keeper:
+    """Keeps what a replay that goes on from the middle needs: samples as the estimator got them, and its states.
+
+    A state that cannot be kept ends the keeping of states, and a note says so.
+    """
+
+    def __init__(
+        self, estimator: Estimator[Any], states: CheckpointWriter, sensors: SensorLog | None, notes: list[str]
+    ) -> None:
+        self._estimator, self._states, self._sensors, self._notes = estimator, states, sensors, notes
+        self._steps, self._keeps = 0, True
+        self._keep(-1, estimator.start())
+
+    @property
+    def logs(self) -> bool:
+        """Whether samples are wanted."""
+        return self._sensors is not None
+
+    def __call__(self, original: Sample, decoded: Sample, state: Any, step: Step | None) -> None:
+        """Take note of one sample and the state after it."""
+        if self._sensors is not None:
+            self._sensors.sample(original, decoded)
+        if step is not None:
+            self._steps += 1
+            if self._keeps and self._steps % CHECKPOINT_FRAMES == 0:
+                self._keep(step.frame, state)
+
+    def _keep(self, frame: int, state: Any) -> None:
+        packed = self._estimator.packed(state) if isinstance(self._estimator, Resumable) else state
+        try:
+            self._states.write(frame, packed)
+        except CheckpointError as error:
+            self._keeps = False
+            self._notes.append(f"no states are kept to go on from: {error}")
+
+
 @dataclass(frozen=True, kw_only=True)
 class _Session:
     """One replay with every choice made."""
@@ -582,7 +621,8 @@ class _Session:
             sensors = self._sensors(writers, files)
             run = files.enter_context(contextlib.closing(self._run_writer(writers)))
             tum = self._trajectory(files)
-            steps = files.enter_context(contextlib.closing(self._steps(on_progress)))
+            keep = _Keeper(self.estimator, files.enter_context(self._checkpoints()), sensors, self.notes)
+            steps = files.enter_context(contextlib.closing(self._steps(on_progress, keep)))
             try:
                 for replayed in steps:
                     self._take(replayed, sensors, run, tum, tally, span)
@@ -606,7 +646,11 @@ class _Session:
         self._file("tum").unlink(missing_ok=True)
         return None
 
-    def _steps(self, on_progress: Callable[[Progress], None] | None) -> Generator[Replayed]:
+    def _checkpoints(self) -> CheckpointWriter:
+        about = {"digest": self.digest, "run": self.name, "estimator": self.estimator.name}
+        return CheckpointWriter(self._file("checkpoints"), about)
+
+    def _steps(self, on_progress: Callable[[Progress], None] | None, keep: _Keeper) -> Generator[Replayed]:
         total = self._expected()
 
         def tell(done: int, t_ns: int) -> None:
@@ -624,6 +668,8 @@ class _Session:
             stride=self.request.stride,
             latency=self.chosen.latency,
             on_progress=tell,
+            beside_streams=self._kept_streams() if keep.logs else (),
+            on_sample=keep,
         )
 
     def _take(
@@ -713,7 +759,7 @@ class _Session:
         """The writer of the mission's measurements, None where they stand there already."""
         record, file = self.folder / "sensors.toml", self.folder / "sensors.rrd"
         wanted = to_toml(self._sensors_values())
-        if file.is_file() and record.is_file() and tomllib.loads(record.read_text("utf-8")) == tomllib.loads(wanted):
+        if file.is_file() and _recorded(record) == tomllib.loads(wanted):
             return None
         record.unlink(missing_ok=True)
         writer = writers.sensors(
@@ -753,11 +799,38 @@ class _Session:
             "format": FORMAT,
             "digest": self.digest,
             "image_stream": self.chosen.shown or self.chosen.frames,
+            "frame_stream": self.chosen.frames,
+            "streams": self._kept_streams(),
+            "order": self._order,
             "reference_stream": self.chosen.reference.stream,
             "raw_images": self.request.raw_images,
             "window": self._window_values(),
             "versions": {"estimator-workbench": _version("estimator-workbench"), "rerun-sdk": _version("rerun-sdk")},
         }
+
+    @functools.cached_property
+    def _earlier(self) -> dict[str, Any]:
+        """What stands in the sensors' file by now, empty where there is none."""
+        return _recorded(self.folder / "sensors.toml")
+
+    @property
+    def _order(self) -> str:
+        """In what order the estimator gets the samples."""
+        return "stamps" if self.chosen.latency is None else self.chosen.latency.order
+
+    def _kept_streams(self) -> list[str]:
+        """The streams whose samples the sensors' file holds: this run's, and those of the runs before it."""
+        earlier = self._earlier
+        same = ("digest", "image_stream", "frame_stream", "window", "order")
+        now = {
+            "digest": self.digest,
+            "image_stream": self.chosen.shown or self.chosen.frames,
+            "frame_stream": self.chosen.frames,
+            "window": {key: value for key, value in self._window_values().items() if value is not None},
+            "order": self._order,
+        }
+        kept = earlier.get("streams", []) if all(earlier.get(key) == now[key] for key in same) else []
+        return sorted({self.chosen.frames, *self.chosen.others, *kept})
 
     def _write_toml(self, state: dict[str, Any]) -> None:
         values = {
@@ -771,6 +844,8 @@ class _Session:
                 "recording": str(self.request.path),
                 "digest": self.digest,
                 "image_stream": self.chosen.frames,
+                "other_streams": list(self.chosen.others),
+                "order": self._order,
                 "reference_stream": self.chosen.reference.stream,
                 "reference_offset_s": self.request.reference_offset_s,
             },
@@ -834,6 +909,14 @@ def _log_sample(sensors: SensorLog, step: Step, sample: ImageSample | Problem) -
         sensors.image(step.frame, sample)
     except ImageError as error:
         sensors.undecodable(step.frame, step.t_ns, str(error))
+
+
+def _recorded(record: Path) -> dict[str, Any]:
+    """What a file of TOML says, nothing where there is none that can be read."""
+    try:
+        return tomllib.loads(record.read_text("utf-8"))
+    except (OSError, ValueError):
+        return {}
 
 
 def _flat(rows: Sequence[tuple[str, str]]) -> dict[str, str]:

@@ -21,7 +21,7 @@ if TYPE_CHECKING:
     from pydantic import BaseModel
     from pydantic_core import ErrorDetails
 
-    from pipelines.estimator import Estimator
+    from pipelines.estimator import Estimator, Step
 
 ENTRY_POINTS = "estimator_workbench.estimators"
 PREFERRED_PRESET = "best"
@@ -41,7 +41,8 @@ class Plugin:
 
     `answers` says what its steps are about: the vehicle's ``path``, or ``ranges`` to landmarks. `settings` is its
     frozen pydantic model with ``extra="forbid"``; where that has presets, it has the class
-    methods ``presets() -> tuple[str, ...]`` and ``preset(name)``. `build` makes the estimator of such settings.
+    methods ``presets() -> tuple[str, ...]`` and ``preset(name)``. `build` makes the estimator of such settings; `step`
+    is the class of its steps where that is one for all settings, so that a run can be read without the estimator.
     Another package offers one under the entry point group `estimator_workbench.estimators`, as a `Plugin` or
     as a function without arguments that returns one.
     """
@@ -50,6 +51,11 @@ class Plugin:
     settings: type[BaseModel]
     build: Callable[[Any], Estimator[Any]]
     answers: Literal["path", "ranges"] = "path"
+    step: type[Step] | None = None
+
+    def step_type(self, settings: BaseModel) -> type[Step]:
+        """The class of the steps under these settings."""
+        return self.build(settings).step_type if self.step is None else self.step
 
     @property
     def presets(self) -> tuple[str, ...]:
@@ -76,17 +82,27 @@ class Plugin:
 
 
 def _correlation() -> Plugin:
-    from pipelines.correlation.odometry import CorrelationOdometry
     from pipelines.correlation.settings import CorrelationSettings
+    from pipelines.correlation.step import CorrelationStep
 
-    return Plugin("correlation", CorrelationSettings, CorrelationOdometry)
+    def build(settings: CorrelationSettings) -> Estimator[Any]:
+        from pipelines.correlation.odometry import CorrelationOdometry
+
+        return CorrelationOdometry(settings)
+
+    return Plugin("correlation", CorrelationSettings, build, step=CorrelationStep)
 
 
 def _range() -> Plugin:
-    from pipelines.ranging.range_filter import RangeFilter
     from pipelines.ranging.range_settings import RangeSettings
+    from pipelines.ranging.step import RangeStep
 
-    return Plugin("range", RangeSettings, RangeFilter, "ranges")
+    def build(settings: RangeSettings) -> Estimator[Any]:
+        from pipelines.ranging.range_filter import RangeFilter
+
+        return RangeFilter(settings)
+
+    return Plugin("range", RangeSettings, build, "ranges", RangeStep)
 
 
 BUILT_IN: Mapping[str, Callable[[], Plugin]] = {"correlation": _correlation, "range": _range}

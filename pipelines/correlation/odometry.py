@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import dataclass, replace
-from typing import ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -23,7 +23,7 @@ from pipelines.correlation.matching import NO_COVARIANCE, Candidate, Matcher, Te
 from pipelines.correlation.settings import CorrelationSettings
 from pipelines.correlation.step import CorrelationStep
 from pipelines.correlation.trajectory import Pose, Segment, corrected, integrated
-from pipelines.estimator import EstimatorError
+from pipelines.estimator import EstimatorError, FrameImage, Images
 from pipelines.verdict import Verdict, gravest
 from readers.streams import ImageError, ImageSample, PoseSample, Problem, RangeSample, Sample, ScalarSample, StreamKind
 
@@ -134,6 +134,54 @@ class CorrelationOdometry:
         if sample.stream == self._settings.height_stream:
             return replace(state, height_m=_height_of(sample) + self._settings.height_offset_m), None
         return state, None
+
+    # ---------------------------------------------------------------- going on from the middle
+
+    def packed(self, state: CorrelationState) -> CorrelationState:
+        """The state with the images of its frames by number, see `Resumable`; patches are cut again from them."""
+        return replace(state, template=_without_image(state.template), previous=_without_image(state.previous))
+
+    def unpacked(self, packed: Any, images: Images) -> CorrelationState:
+        """The state that was packed, see `Resumable`.
+
+        Raises:
+            EstimatorError: it is no state of this estimator.
+        """
+        if not isinstance(packed, CorrelationState):
+            raise EstimatorError(f"{type(packed).__name__} is no state of the estimator {self.name!r}; replay again")
+        return replace(
+            packed, template=_with_image(packed.template, images), previous=_with_image(packed.previous, images)
+        )
+
+    def adopted(self, state: CorrelationState) -> CorrelationState:
+        """The state under these settings, see `Resumable`.
+
+        Of the running medians the latest values stay; shifts of fragments stay if there are as many fragments; a
+        height that the settings give takes the place of the one before.
+        """
+        s = self._settings
+        height_m = state.height_m if s.height_m is None or s.height_stream else s.height_m
+        shift = state.last_shift
+        history = self._resized(state)
+        return replace(
+            state,
+            template=None if state.template is None else replace(state.template, fragments=None, tiles=None),
+            previous=None if state.previous is None else replace(state.previous, fragments=None, tiles=None),
+            last_shift=shift if shift is not None and len(shift) == s.columns * s.rows else None,
+            height_m=height_m,
+            history=history,
+            usual=state.usual if history is state.history else Usual(*kernels.running_medians(history)),
+        )
+
+    def _resized(self, state: CorrelationState) -> Floats | None:
+        """The values behind the running medians, [3, K] for these settings: as many of the latest as there is room."""
+        if state.history is None or state.history.shape[1] == self._settings.median_frames:
+            return state.history
+        before, now = state.history.shape[1], self._settings.median_frames
+        latest = state.frames - 1 - np.arange(min(before, now))
+        history = np.full((3, now), np.nan)
+        history[:, latest % now] = state.history[:, latest % before]
+        return history
 
     # ------------------------------------------------------------------------------ one frame
 
@@ -454,6 +502,17 @@ class CorrelationOdometry:
             pose=np.array([x + total_x, y + total_y, heading]),
             pose_covariance=covariance,
         )
+
+
+def _without_image(template: Template | None) -> Any:
+    if template is None:
+        return None
+    image: Any = FrameImage(template.frame)
+    return replace(template, grey=image, fragments=None, tiles=None)
+
+
+def _with_image(template: Template | None, images: Images) -> Template | None:
+    return None if template is None else replace(template, grey=eight_bit(images(template.frame)))
 
 
 def eight_bit(grey: NDArray[np.uint8] | NDArray[np.uint16]) -> Grey:

@@ -16,14 +16,14 @@ from typing import Any, ClassVar, NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.estimator import EstimatorError
+from pipelines.estimator import EstimatorError, Images
 from pipelines.ranging import ego_motion, start
 from pipelines.ranging import equations as eq
 from pipelines.ranging.beliefs import Separate, Together
 from pipelines.ranging.ego_motion import Arc
 from pipelines.ranging.filter import Inputs, Outcome, Update, statuses
 from pipelines.ranging.landmarks.settings import LandmarkKind
-from pipelines.ranging.landmarks.sources import source_of
+from pipelines.ranging.landmarks.sources import AutomaticSource, source_of
 from pipelines.ranging.range_judging import History, Trends, alarms_of_frame
 from pipelines.ranging.range_settings import MotionModel, RangeSettings, StartKind
 from pipelines.ranging.robot_motion import (
@@ -242,6 +242,52 @@ class RangeFilter:
             return self._source.sight(state.source, sample)
         except ValueError as error:
             raise EstimatorError(str(error)) from error
+
+    # ---------------------------------------------------------------- going on from the middle
+
+    def packed(self, state: RangeState) -> RangeState:
+        """The state without settings, see `Resumable`; the last image of tracked corners stays in it."""
+        if isinstance(self._source, AutomaticSource):
+            return replace(state, source=self._source.packed(state.source))
+        return state
+
+    def unpacked(self, packed: Any, images: Images) -> RangeState:
+        """The state that was packed, see `Resumable`.
+
+        Raises:
+            EstimatorError: it is no state of this estimator, or of one with other kinds of landmarks.
+        """
+        if not isinstance(packed, RangeState):
+            raise EstimatorError(f"{type(packed).__name__} is no state of the estimator {self.name!r}; replay again")
+        if isinstance(self._source, AutomaticSource):
+            try:
+                return replace(packed, source=self._source.unpacked(packed.source))
+            except ValueError as error:
+                raise EstimatorError(str(error)) from error
+        return packed
+
+    def adopted(self, state: RangeState) -> RangeState:
+        """The state under these settings, see `Resumable`.
+
+        The landmarks go on with their means and covariances; settings of the start tell on those that start later.
+
+        Raises:
+            EstimatorError: other kinds of landmarks or of filter, or more landmarks than there may be now.
+        """
+        s, fresh = self._settings, self.start()
+        if type(fresh.source) is not type(state.source):
+            raise EstimatorError("landmarks: the landmarks of another source cannot be taken over; replay as a whole")
+        if type(fresh.belief) is not type(state.belief):
+            raise EstimatorError("mode: separate and joint filters cannot take over from each other; replay as a whole")
+        needed = int(state.roster.slots.max(initial=-1)) + 1
+        if needed > s.max_landmarks:
+            raise EstimatorError(
+                f"max_landmarks = {s.max_landmarks}: the landmarks followed by then take {needed} places; "
+                f"set max_landmarks={needed} or more"
+            )
+        if not isinstance(self._source, AutomaticSource):
+            return state
+        return self.unpacked(replace(state, source=self._source.packed(state.source)), _no_images)
 
     # ------------------------------------------------------------------------------ one frame
 
@@ -638,6 +684,10 @@ def _source_of(settings: RangeSettings) -> LandmarkSource[Any]:
         return source_of(settings, settings.camera, surveyed=settings.only_landmarks or None)
     except ValueError as error:
         raise EstimatorError(str(error)) from error
+
+
+def _no_images(frame: int) -> NDArray[np.uint8]:
+    raise EstimatorError(f"the state asks for the image of frame {frame}; replay again")
 
 
 def _continued(motion: CameraMotion, ride: Ride, variance: Floats) -> CameraMotion:

@@ -56,6 +56,13 @@ class Chosen(NamedTuple):
     state: Any
 
 
+class Named(NamedTuple):
+    """A source that was chosen, by its name without its settings, and its state."""
+
+    kind: LandmarkKind | None
+    state: Any
+
+
 @dataclass(frozen=True, slots=True)
 class AutomaticSource:
     """The source that suits the first frame, from then on; frames of another kind are then no frames."""
@@ -83,6 +90,21 @@ class AutomaticSource:
             inner = source.start()
         inner, sighting = source.sight(inner, sample)
         return Chosen(source, inner), sighting
+
+    def packed(self, state: Chosen) -> Named:
+        """The state without settings."""
+        kinds = {RecordedBearings: LandmarkKind.BEARINGS, RecordedTracks: LandmarkKind.TRACKS}
+        kind = None if state.source is None else kinds.get(type(state.source), LandmarkKind.CORNERS)
+        return Named(kind, state.state)
+
+    def unpacked(self, packed: Named) -> Chosen:
+        """The state, going on with these settings.
+
+        Raises:
+            ValueError: the source needs a calibrated camera, and there is none.
+        """
+        source = None if packed.kind is None else _source(packed.kind, self.settings, self.camera, self.surveyed)
+        return Chosen(source, packed.state)
 
 
 def _kind_of(sample: Sample) -> LandmarkKind | None:
