@@ -390,7 +390,7 @@ def test_the_command(walked: dict[str, Path], tmp_path: Path, capsys: pytest.Cap
         ("best.checkpoints", {"start": "9"}, RecordingError, "best.checkpoints: the run has no checkpoints; replay"),
         ("sensors.rrd", {}, RecordingError, "sensors.rrd: is missing.*; replay"),
         ("sensors.toml", {}, RecordingError, "sensors.rrd: is missing.*; replay"),
-        ("best.toml", {}, RecordingError, "best.toml: cannot be read"),
+        ("best.toml", {}, RecordingError, "run/best: there is no such run"),
     ],
 )
 def test_what_cannot_be_answered(
@@ -415,7 +415,7 @@ def test_samples_of_another_recording_or_window_are_refused(walked: dict[str, Pa
     with pytest.raises(RecordingError, match="of another recording than best"):
         ask(Question(run=folder / "best.rrd"))
     record.write_text(text.replace("stride = 1", "stride = 2"))
-    with pytest.raises(RecordingError, match="another window or stream"):
+    with pytest.raises(RecordingError, match="another window, stream"):
         ask(Question(run=folder / "best.rrd"))
     with pytest.raises(RecordingError, match=r"holds 2 runs: best, paper-a; name one"):
         ask(Question(run=folder))
