@@ -1,4 +1,4 @@
-"""The commands: inspect, replay, simulate, view, demo, reproduce, settings. The only module that prints.
+"""The commands: inspect, replay, simulate, view, report, demo, reproduce, settings. The only module that prints.
 
 What a command concludes goes to stdout, progress and errors to stderr. Exit status: 0 done; 2 a request that
 cannot be met (one line says why); 3 the recording could be read only in part; 130 interrupted; 1 a fault of the
@@ -566,6 +566,63 @@ def _has_display() -> bool:
     if sys.platform != "linux":
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+# --------------------------------------------------------------------------------- report
+
+
+@app.command(
+    short_help="Make a page that tells what a run concluded, what failed, and why.",
+    epilog=_examples(
+        "workbench report results/mission -o report.html",
+        "workbench report results/mission/best.rrd --md > report.md",
+        "workbench report results/mission --md -o report.md --pictures pictures/",
+        "workbench report results/mission --json | jq .findings[0]",
+    ),
+)
+def report(
+    run: Annotated[
+        Path, typer.Argument(metavar="RUN", help="RUN.rrd, RUN.toml, or a folder of results", show_default=False)
+    ],
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="File to write [RUN.html beside the run].")
+    ] = None,
+    as_markdown: Annotated[bool, typer.Option("--md", help="Short Markdown instead, on stdout without -o.")] = False,
+    picture_folder: Annotated[
+        Path | None, typer.Option("--pictures", metavar="DIR", help="Of --md: the findings' pictures as SVG files.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make one page of a run: verdict, ranked findings with pictures, errors, metrics, settings, versions.
+
+    The page holds everything that it shows, opens without a network, and prints. --md is for a pull request.
+    """
+    from workbench import report as reports
+    from workbench.runs import open_run
+    from workbench.settings import SettingsError
+
+    if as_json and as_markdown:
+        raise SettingsError("--json and --md: choose one")
+    if picture_folder is not None and not as_markdown:
+        raise SettingsError("--pictures goes with --md; the HTML page holds its pictures")
+    opened = open_run(run)
+    facts = reports.facts_of(opened, str(run))
+    if as_json:
+        if out is not None:
+            raise SettingsError("--json prints on stdout; leave -o out")
+        _print_json(reports.values(facts))
+    elif as_markdown:
+        text = reports.text_of(facts, picture_folder, None if out is None else out.parent)
+        if out is None:
+            print(text, end="")
+        else:
+            _tell_written(reports.write(text, out))
+    else:
+        _tell_written(reports.write(reports.page_of(facts), out or opened.file.with_suffix(".html")))
+
+
+def _tell_written(file: Path) -> None:
+    print(f"report  {file} ({file.stat().st_size / 1e6:.2f} MB)")
 
 
 # ----------------------------------------------------------------------------------- demo

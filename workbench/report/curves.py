@@ -1,0 +1,263 @@
+"""What a report plots of a run: curves over its frames, thinned without losing an extreme."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from scipy.stats import chi2
+
+from pipelines.verdict import Severity, Verdict
+from workbench.runs import Run
+
+Floats = NDArray[np.float64]
+Ints = NDArray[np.int64]
+
+MOST_POINTS = 2000
+"""Points of a plot; more are thinned."""
+MOST_SLOTS = 8
+"""Slots of landmarks that have curves."""
+BAND = 0.95
+
+
+@dataclass(frozen=True, slots=True)
+class Curve:
+    """One line of a plot: `values` [n] by frame. `role` is ``line``, ``bound`` (dashed) or ``reference``."""
+
+    name: str
+    values: Floats
+    role: str = "line"
+
+
+@dataclass(frozen=True, slots=True)
+class Chart:
+    """A plot over the frames of a run.
+
+    Attributes:
+        key: short name, for links.
+        title: what it shows.
+        unit: of its values.
+        about: how to read it, in a sentence.
+        frame: numbers of the frames [n].
+        t_s: seconds since the first frame [n].
+        curves: lines, values [n] each.
+        from_zero: whether its axis begins at zero.
+    """
+
+    key: str
+    title: str
+    unit: str
+    about: str
+    frame: Ints
+    t_s: Floats
+    curves: tuple[Curve, ...]
+    from_zero: bool = False
+
+    def thinned(self, most: int = MOST_POINTS) -> Chart:
+        """The chart with at most that many points, the extremes of every curve among them."""
+        rows = extremes(np.column_stack([curve.values for curve in self.curves]), most)
+        curves = tuple(dataclasses.replace(curve, values=curve.values[rows]) for curve in self.curves)
+        return dataclasses.replace(self, frame=self.frame[rows], t_s=self.t_s[rows], curves=curves)
+
+
+@dataclass(frozen=True, slots=True)
+class Ways:
+    """The estimated and the reference path from above in m [n, 2], at the same frames; the reference may be NaN."""
+
+    frame: Ints
+    t_s: Floats
+    estimate: Floats
+    reference: Floats
+
+    def thinned(self, most: int = MOST_POINTS) -> Ways:
+        """The ways with at most that many points."""
+        rows = extremes(np.column_stack([self.estimate, self.reference]), most)
+        return Ways(self.frame[rows], self.t_s[rows], self.estimate[rows], self.reference[rows])
+
+
+@dataclass(frozen=True, slots=True)
+class Strip:
+    """The gravest verdict of each of some stretches of frames: its frame, time and verdict [n]."""
+
+    frame: Ints
+    t_s: Floats
+    verdicts: tuple[Verdict, ...]
+
+
+def extremes(values: Floats, most: int) -> Ints:
+    """Rows of `values` [n, k] to keep, at most `most`: of stretches of equal length those with each column's extremes.
+
+    The first and the last row are among them; a stretch without a number keeps its first row.
+    """
+    n, k = values.shape
+    if n <= most:
+        return np.arange(n)
+    stretches = max(1, (most - 2) // (2 * k))
+    edges = np.linspace(0, n, stretches + 1).astype(np.int64)
+    kept = {0, n - 1}
+    for start, stop in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True):
+        part = values[start:stop]
+        low, high = np.where(np.isnan(part), np.inf, part), np.where(np.isnan(part), -np.inf, part)
+        kept.update((start + np.concatenate([low.argmin(axis=0), high.argmax(axis=0)])).tolist())
+    return np.array(sorted(kept), np.int64)
+
+
+def seconds(run: Run) -> Floats:
+    """Seconds since the first frame [n]."""
+    return np.asarray((run.t_ns - run.t_ns[0]) / 1e9, np.float64)
+
+
+def strip(run: Run, most: int = 500) -> Strip:
+    """The verdicts of a run, the gravest of each stretch of frames."""
+    verdicts = run.verdicts
+    grave = np.array([(v.severity, v.value) for v in verdicts], dtype=[("s", "i8"), ("v", "i8")])
+    order = np.argsort(np.argsort(grave, order=("s", "v"), kind="stable"), kind="stable")
+    edges = np.linspace(0, len(verdicts), min(most, len(verdicts)) + 1).astype(np.int64)
+    rows = [a + int(np.argmax(order[a:b])) for a, b in zip(edges[:-1].tolist(), edges[1:].tolist(), strict=True)]
+    return Strip(run.frames[rows], seconds(run)[rows], tuple(verdicts[row] for row in rows))
+
+
+def ways(run: Run) -> Ways | None:
+    """The paths of a run, laid over one another as its evaluation did; None of an estimator without a path."""
+    from pipelines.evaluation import Alignment, associate
+
+    path = run.column("pose")[:, :3] if "pose" in run.fields else None
+    if path is None:
+        return None
+    evaluation = run.summary.get("evaluation")
+    if evaluation:
+        told = evaluation["alignment"]
+        path = Alignment(
+            rotation_rad=math.radians(told["rotation_deg"]),
+            translation_m=np.array(told["translation_m"], np.float64),
+            scale=told["scale"],
+        )(path)
+    reference = np.full((len(path), 3), np.nan)
+    if run.reference is not None:
+        offset_ns = round(float(run.toml["run"].get("reference_offset_s", 0.0)) * 1e9)
+        reference = associate(run.t_ns, run.reference, offset_ns=offset_ns)
+    return Ways(run.frames, seconds(run), path[:, :2], reference[:, :2])
+
+
+def errors(run: Run) -> list[Chart]:
+    """Errors against the reference; none where there is none."""
+    if run.errors is None:
+        return []
+    frames, t_s = run.frames, seconds(run)
+    place = np.full((len(frames), 4), np.nan)
+    rows = np.searchsorted(frames, run.errors.frame).clip(0, len(frames) - 1)
+    good = frames[rows] == run.errors.frame
+    place[rows[good]] = run.errors.values[good]
+    found = [
+        Chart("position-error", "Position error", "m", "Distance from the reference after alignment.", frames, t_s,
+              (Curve("position error", place[:, 2]),), from_zero=True)
+    ]  # fmt: skip
+    if np.isfinite(place[:, 3]).any():
+        heading = (Curve("heading error", np.degrees(place[:, 3])),)
+        about = "Heading of the estimate minus that of the reference, after alignment."
+        found.append(Chart("heading-error", "Heading error", "°", about, frames, t_s, heading))
+    return found
+
+
+def own(run: Run) -> list[Chart]:
+    """What the estimator itself says of its work."""
+    return {"correlation": _correlation, "range": _range}.get(run.estimator, _nothing)(run)
+
+
+def _nothing(run: Run) -> list[Chart]:
+    return []
+
+
+def _correlation(run: Run) -> list[Chart]:
+    frames, t_s = run.frames, seconds(run)
+    names = ["residual_rms", "peak_ratio", "peak_correlation", "inliers"]
+    residual, ratio, peak, inliers = (run.columns(names)[name] for name in names)
+
+    def bound(name: str) -> tuple[Curve, ...]:
+        value = run.settings.get(name)
+        return () if value is None else (Curve(f"bound {name}", np.full(len(frames), float(value)), "bound"),)
+
+    def chart(key: str, title: str, unit: str, about: str, *curves: Curve) -> Chart:
+        return Chart(key, title, unit, about, frames, t_s, curves)
+
+    return [
+        chart("residual", "Residual of the match", "grey", "Root mean square of what remains after matching.",
+              Curve("median of the fragments", _over(np.nanmedian, residual)),
+              Curve("worst fragment", _over(np.nanmax, residual))),
+        chart("peak-ratio", "Second peak against the first", "1",
+              "Near one, two places look equally good and the match may be the wrong one.",
+              Curve("median of the fragments", _over(np.nanmedian, ratio)),
+              Curve("worst fragment", _over(np.nanmax, ratio)), *bound("max_peak_ratio")),
+        chart("correlation", "Correlation at the peak", "1", "Near one, the fragment looks like its template.",
+              Curve("median of the fragments", _over(np.nanmedian, peak)),
+              Curve("worst fragment", _over(np.nanmin, peak)), *bound("min_correlation")),
+        chart("inliers", "Fragments that agree", "1", "How many fragments and tiles fit one rigid motion.",
+              Curve("inliers", inliers.astype(np.float64)), *bound("min_inliers")),
+    ]  # fmt: skip
+
+
+def _over(statistic: Any, values: Floats) -> Floats:
+    """A statistic of each row [n] of `values` [n, k], NaN left out; NaN of a row without a number."""
+    found = np.full(len(values), np.nan)
+    some = np.isfinite(values).any(axis=1)
+    if some.any():
+        found[some] = statistic(np.where(np.isfinite(values[some]), values[some], np.nan), axis=1)
+    return found
+
+
+def _range(run: Run) -> list[Chart]:
+    frames, t_s = run.frames, seconds(run)
+    nis, sigma = run.columns(["nis", "relative_sigma"]).values()
+    used = [k for k in range(sigma.shape[1]) if np.isfinite(sigma[:, k]).any()]
+    shown, rest = used[:MOST_SLOTS], len(used) - len(used[:MOST_SLOTS])
+    more = f" {rest} more slots are in the recording's columns." if rest else ""
+    charts = [chart for k in shown for chart in _slot(run, k)]
+    charts.append(_nis(run, nis))
+    about = "σ_ξ/ξ of the landmark in each slot: what the filter believes to know of its range." + more
+    lines = tuple(Curve(f"slot {k}", np.where(np.isfinite(sigma[:, k]), sigma[:, k], np.nan)) for k in shown)
+    if lines:
+        charts.append(Chart("relative-sigma", "Relative uncertainty", "1", about, frames, t_s, lines, from_zero=True))
+    return charts
+
+
+def _slot(run: Run, slot: int) -> list[Chart]:
+    """Range of the landmark in a slot against the reference, as the replay logged it."""
+    from workbench.rrd_reading import series
+
+    found = series(run.file, f"{run.root}/landmark/{slot}/range", "Scalars:scalars")
+    if not len(found.frame):
+        return []
+    values = np.full((len(run.frames), found.values.shape[1]), np.nan)
+    rows = np.searchsorted(run.frames, found.frame).clip(0, len(run.frames) - 1)
+    good = run.frames[rows] == found.frame
+    values[rows[good]] = found.values[good]
+    depth, near, far, reference = values.T[:4]
+    far = np.where(far < 5 * np.nanmax(np.where(np.isfinite(depth), depth, np.nan)), far, np.nan)
+    curves = [Curve("range Z", depth), Curve("nearest (2σ)", near, "bound"), Curve("farthest (2σ)", far, "bound")]
+    if np.isfinite(reference).any():
+        curves.append(Curve("reference", reference, "reference"))
+    about = "Depth along the optical axis, with what ± 2 σ_ξ leaves open, against the reference where there is one."
+    title = f"Range of the landmark in slot {slot}"
+    return [Chart(f"range-{slot}", title, "m", about, run.frames, seconds(run), tuple(curves), from_zero=True)]
+
+
+def _nis(run: Run, nis: Floats) -> Chart:
+    """Mean NIS of each frame's landmarks, with the band that it keeps in 95 % of the frames of a right filter."""
+    count = np.isfinite(nis).sum(axis=1)
+    degrees = float(run.summary.get("ranging", {}).get("nis", {}).get("expected", 2.0))
+    mean = _over(np.nanmean, nis)
+    dof = np.where(count > 0, degrees * count, np.nan)
+    low, high = (chi2.ppf(end, dof) / np.where(count > 0, count, 1) for end in ((1 - BAND) / 2, (1 + BAND) / 2))
+    curves = (Curve("mean NIS", mean), Curve("χ² low", low, "bound"), Curve("χ² high", high, "bound"))
+    about = "Squared innovations over what the filter expects, mean of the frame's landmarks; the band holds 95 %."
+    return Chart("nis", "Innovations (NIS)", "1", about, run.frames, seconds(run), curves, from_zero=True)
+
+
+def gravest(verdicts: Sequence[Verdict]) -> Severity:
+    """The gravest severity of some verdicts."""
+    return max((v.severity for v in verdicts), default=Severity.FINE)

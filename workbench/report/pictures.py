@@ -1,0 +1,303 @@
+"""The picture of a frame: its image with what the estimator drew on it, and its correlation surfaces.
+
+Drawings carry their own colours, so that each also stands as a file of its own.
+"""
+
+from __future__ import annotations
+
+import base64
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import cv2
+import numpy as np
+from numpy.typing import NDArray
+
+from readers.streams import RecordingError, StreamError
+from workbench import traces
+from workbench.report.markup import Element, el
+from workbench.runs import Run
+from workbench.schema import Archetype
+
+Floats = NDArray[np.float64]
+
+WIDEST_PX = 640
+JPEG_QUALITY = 80
+CANVAS_PX = (640.0, 480.0)
+BLUE, YELLOW, RED, WHITE, GREEN = "#4fc3f7", "#ffd54f", "#ff5252", "#ffffff", "#00e676"
+
+_OVERLAY_FIELDS = (
+    "fragment_px", "fragment_side_px", "search_centre_px", "search_radius_px", "shift_px", "weight", "accepted",
+    "tile_px", "tile_shift_px", "tile_weight",
+)  # fmt: skip
+_PEAK_FIELDS = ("peak_px", "second_peak_px", "peak_correlation", "second_peak_correlation", "peak_ratio")
+_DRAWN = {"measured": "Points2D:positions", "predicted": "Points2D:positions", "gate": "LineStrips2D:strips",
+          "focus": "LineStrips2D:strips"}  # fmt: skip
+_ARROWS = ("Arrows2D:origins", "Arrows2D:vectors")
+
+
+@dataclass(frozen=True)
+class Picture:
+    """What there is to see of one frame.
+
+    Attributes:
+        frame: its number.
+        image: the drawing with the image, or on a blank canvas; None where nothing was drawn.
+        caption: what is on it.
+        surfaces: the correlation surfaces; None of an estimator or a frame without.
+        surfaces_caption: what is on them.
+    """
+
+    frame: int
+    image: Element | None
+    caption: str
+    surfaces: Element | None = None
+    surfaces_caption: str = ""
+
+
+def pictures(run: Run, frames: Iterable[int]) -> dict[int, Picture]:
+    """The pictures of some frames, each part of the files read once.
+
+    Raises:
+        RecordingError: a file of the run cannot be read.
+    """
+    wanted = sorted(set(frames) & set(run.frames.tolist()))
+    if not wanted:
+        return {}
+    if run.estimator == "correlation":
+        stored = _stored_surfaces(run, wanted)
+        return {frame: _correlation(run, frame, stored.get(frame)) for frame in wanted}
+    drawn = _drawn(run, wanted)
+    return {frame: _drawn_picture(run, frame, drawn) for frame in wanted}
+
+
+# -------------------------------------------------------------------------------- the image
+
+
+def _image(run: Run, frame: int) -> tuple[list[Element], tuple[float, float] | None, str]:
+    """A frame's image as an element, its size, and a word where there is none."""
+    try:
+        sample = run.image(frame)
+        grey: NDArray[Any] | None = None if sample is None else sample.grey()
+    except (RecordingError, StreamError) as error:
+        return [], None, f" There is no image: {error}."
+    if grey is None:
+        return [], None, " The run holds no image of this frame."
+    height, width = grey.shape
+    if grey.dtype != np.uint8:
+        grey = cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
+    if width > WIDEST_PX:
+        size = (WIDEST_PX, max(1, round(height * WIDEST_PX / width)))
+        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    done, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
+    if not done:
+        return [], None, " The image could not be encoded."
+    return [_embedded(encoded.tobytes(), "jpeg", width, height)], (float(width), float(height)), ""
+
+
+def _embedded(blob: bytes, form: str, width: float, height: float, **more: str) -> Element:
+    uri = f"data:image/{form};base64,{base64.b64encode(blob).decode()}"
+    return el("image", href=uri, width=width, height=height, **more)
+
+
+def _svg(size: tuple[float, float], label: str, *content: Any) -> Element:
+    return el("svg", *content, viewBox=f"0 0 {size[0]:g} {size[1]:g}", role="img", aria_label=label, class_="picture")
+
+
+def _hex(colour: int) -> str:
+    return f"#{int(colour) >> 8:06x}"
+
+
+def _box(centre: Floats, half: Floats, colour: str, **more: str) -> Element:
+    (u, v), (w, h) = centre.tolist(), half.tolist()
+    return el("rect", x=f"{u - w:.1f}", y=f"{v - h:.1f}", width=f"{2 * w:.1f}", height=f"{2 * h:.1f}",
+              fill="none", stroke=colour, **more)  # fmt: skip
+
+
+def _arrow(start: Floats, vector: Floats, colour: str, width: str = "1.6") -> Element:
+    (u, v), (a, b) = start.tolist(), vector.tolist()
+    return el(
+        "g",
+        el("path", d=f"M{u:.1f} {v:.1f}l{a:.1f} {b:.1f}", stroke=colour, stroke_width=width, fill="none"),
+        el("circle", cx=f"{u + a:.1f}", cy=f"{v + b:.1f}", r="2.2", fill=colour),
+    )
+
+
+# -------------------------------------------------------------------------------- correlation
+
+
+def _correlation(run: Run, frame: int, surface: NDArray[Any] | None) -> Picture:
+    row = run.row_of(frame)
+    table = {name: column[row : row + 1] for name, column in run.columns(_OVERLAY_FIELDS).items()}
+    shapes = traces.overlays(table)
+    picture, size, excuse = _image(run, frame)
+    width, height = size or _around(shapes)
+    marks: list[Element] = [
+        _box(c, h, BLUE, stroke_width="1", stroke_dasharray="4 3")
+        for c, h in zip(shapes["search"].points, shapes["search"].extents, strict=True)
+    ]
+    marks += [_box(c, h, WHITE, stroke_width="1") for c, h in zip(*shapes["fragments"][1:3], strict=True)]
+    for name, draw in (("matches", _box), ("shifts", _arrow)):
+        colours = shapes[name].colours
+        assert colours is not None
+        marks += [
+            draw(point, extent, _hex(colour))
+            for point, extent, colour in zip(shapes[name].points, shapes[name].extents, colours, strict=True)
+        ]
+    caption = (
+        f"Frame {frame}: fragments of the template (white), search areas (blue, dashed), matches and shifts (green: "
+        "trusted, red: not, grey: the frame was not accepted)."
+    )
+    blank = [] if picture else [el("rect", width=width, height=height, fill="#222222")]
+    image = _svg((width, height), f"image of frame {frame} with fragments and matches", blank, picture, marks)
+    surfaces, told = _surfaces(run, row, frame, surface)
+    return Picture(frame, image, caption + excuse, surfaces, told)
+
+
+def _around(shapes: Mapping[str, traces.Shapes]) -> tuple[float, float]:
+    """The size of a canvas that holds some shapes."""
+    ends = [s.points + s.extents for s in shapes.values() if len(s.points)]
+    if not ends:
+        return CANVAS_PX
+    width, height = np.concatenate(ends).max(axis=0) + 10
+    return float(width), float(height)
+
+
+def _stored_surfaces(run: Run, frames: Sequence[int]) -> dict[int, NDArray[Any]]:
+    """The surfaces of some frames as the images that hold them all, float16."""
+    from workbench.rrd_reading import chunks
+
+    found: dict[int, NDArray[Any]] = {}
+    component = Archetype.SURFACES.value
+    entity = f"{run.root}/{run.schema.entity('surface')}"
+    for chunk in chunks(run.file, entity, components=[component]):
+        batch = chunk.to_record_batch()
+        names = batch.schema.names
+        if "frame" not in names:
+            continue
+        numbers = batch.column("frame").to_numpy()
+        for row in np.flatnonzero(np.isin(numbers, frames)).tolist():
+            if component in names and batch.column(component)[row].as_py():
+                blob = bytes(batch.column(component)[row].as_py()[0])
+                found[int(numbers[row])] = np.frombuffer(blob, np.float16)
+    return found
+
+
+def _surfaces(run: Run, row: int, frame: int, stored: NDArray[Any] | None) -> tuple[Element | None, str]:
+    """The surfaces of a frame as a heat map with both peaks of each, and the numbers of the worst one."""
+    peaks = {name: column[row] for name, column in run.columns(_PEAK_FIELDS).items()}
+    here = {name: run.column(name)[row] for name in ("fragment_px", "search_centre_px", "search_radius_px",
+                                                     "fragment_side_px")}  # fmt: skip
+    if stored is None:
+        return None, "The correlation surfaces of this frame were not kept."
+    at = traces.cells(here["fragment_px"], float(here["fragment_side_px"]))
+    columns = int(at[:, 1].max()) + 1
+    rows = int(at[:, 0].max()) + 1
+    side = _side(stored.size, rows, columns)
+    if side is None or not np.isfinite(stored).any():
+        return None, "The correlation surfaces of this frame hold no number."
+    height, width = rows * (side + 1) - 1, columns * (side + 1) - 1
+    picture = _heat(stored.reshape(height, width).astype(np.float64))
+    done, encoded = cv2.imencode(".png", picture)
+    if not done:
+        return None, "The correlation surfaces could not be encoded."
+    corners = at[:, ::-1] * (side + 1)
+    centre = here["search_centre_px"] - here["fragment_px"]
+    marks = []
+    for name, colour in (("second_peak_px", RED), ("peak_px", WHITE)):
+        points = corners + np.round(peaks[name] - centre) + (side - 1) / 2 + 0.5
+        marks += [
+            el("circle", cx=f"{u:.1f}", cy=f"{v:.1f}", r="1.4", fill="none", stroke=colour, stroke_width="0.5")
+            for u, v in points[np.isfinite(points).all(axis=1)].tolist()
+        ]
+    image = _embedded(encoded.tobytes(), "png", width, height, image_rendering="pixelated")
+    told = f"Correlation surfaces of frame {frame}, fragments as on the image (white: peak, red: second peak)."
+    ratio = peaks["peak_ratio"]
+    if np.isfinite(ratio).any():
+        k = int(np.nanargmax(ratio))
+        told += (
+            f" Fragment {k + 1} is the most ambiguous: peak {peaks['peak_correlation'][k]:.3f}, second peak "
+            f"{peaks['second_peak_correlation'][k]:.3f}, ratio {ratio[k]:.3f}."
+        )
+    label = f"correlation surfaces of frame {frame}"
+    return _svg((float(width), float(height)), label, image, marks), told
+
+
+def _side(size: int, rows: int, columns: int) -> int | None:
+    """Positions a side of the surfaces in a mosaic of that many numbers."""
+    for side in range(1, 400):
+        if (rows * (side + 1) - 1) * (columns * (side + 1) - 1) == size:
+            return side
+    return None
+
+
+def _heat(values: Floats) -> NDArray[np.uint8]:
+    """Correlations as colours, from 0 (dark) to 1 (bright); what is no number is mid grey."""
+    grey = np.round(255 * np.nan_to_num(values).clip(0, 1)).astype(np.uint8)
+    heat = np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS), np.uint8)
+    heat[~np.isfinite(values)] = 96
+    return heat
+
+
+# -------------------------------------------------------------------------------- what a replay drew
+
+
+def _drawn(run: Run, frames: Sequence[int]) -> dict[int, dict[str, list[Any]]]:
+    """What the replay drew on the images of some frames: name → what the viewer gets, by frame."""
+    from workbench.rrd_reading import chunks
+
+    found: dict[int, dict[str, list[Any]]] = {frame: {} for frame in frames}
+    root = f"/camera/image/{run.name}"
+    components = sorted({*_DRAWN.values(), *_ARROWS})
+    for chunk in chunks(run.file, f"{root}/**", components=components):
+        name = chunk.entity_path.removeprefix(f"{root}/")
+        batch = chunk.to_record_batch()
+        parts = {"innovation": _ARROWS}.get(name, (_DRAWN.get(name, ""),))
+        if "frame" not in batch.schema.names or not set(parts) <= set(batch.schema.names):
+            continue
+        numbers = batch.column("frame").to_numpy()
+        for row in np.flatnonzero(np.isin(numbers, frames)).tolist():
+            values = [batch.column(part)[row].as_py() or [] for part in parts]
+            found[int(numbers[row])][name] = values if len(parts) > 1 else values[0]
+    return found
+
+
+def _drawn_picture(run: Run, frame: int, drawn: Mapping[int, Mapping[str, list[Any]]]) -> Picture:
+    here = drawn.get(frame, {})
+    points = [np.asarray(here.get(name, []), np.float64).reshape(-1, 2) for name in ("measured", "predicted")]
+    picture, size, excuse = _image(run, frame)
+    known = np.concatenate(points)
+    if size is None and not len(known):
+        return Picture(frame, None, f"Frame {frame}: no image, and no landmark on it." + excuse)
+    width, height = size or _canvas(run, known)
+    marks = [_line(strip, YELLOW) for strip in here.get("gate", [])]
+    marks += [_line(strip, GREEN) for strip in here.get("focus", [])]
+    marks += [
+        el("path", d=f"M{u - 4:.1f} {v:.1f}h8M{u:.1f} {v - 4:.1f}v8", stroke=BLUE, stroke_width="1.4", fill="none")
+        for u, v in points[1].tolist()
+    ]
+    marks += [el("circle", cx=f"{u:.1f}", cy=f"{v:.1f}", r="3", fill=RED) for u, v in points[0].tolist()]
+    origins, vectors = (np.asarray(part, np.float64).reshape(-1, 2) for part in here.get("innovation", ([], [])))
+    marks += [_arrow(o, v, WHITE, "1") for o, v in zip(origins, vectors, strict=True)]
+    blank = [] if picture else [el("rect", width=width, height=height, fill="#222222")]
+    caption = (
+        f"Frame {frame}: measured points (red), predicted ones (blue crosses), gates (yellow), innovations (white), "
+        "focus of expansion (green)."
+    )
+    image = _svg((width, height), f"image of frame {frame} with landmarks", blank, picture, marks)
+    return Picture(frame, image, caption + excuse)
+
+
+def _canvas(run: Run, points: Floats) -> tuple[float, float]:
+    """The size of a blank canvas: that of the settings' images, or one that holds the points."""
+    size = run.settings.get("image_size_px")
+    if size and len(size) == 2 and min(size) > 0:
+        return float(size[0]), float(size[1])
+    width, height = np.maximum(points.max(axis=0) + 20, CANVAS_PX)
+    return float(width), float(height)
+
+
+def _line(points: Iterable[Iterable[float]], colour: str) -> Element:
+    text = "L".join(f"{u:.1f} {v:.1f}" for u, v in points)
+    return el("path", d=f"M{text}", stroke=colour, stroke_width="1", fill="none")
