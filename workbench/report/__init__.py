@@ -47,7 +47,7 @@ def text_of(facts: Facts, folder: Path | None = None, beside: Path | None = None
     if folder is not None:
         folder.mkdir(parents=True, exist_ok=True)
         for frame, picture in pictures_of(facts).items():
-            for name, element in (("image", picture.image), ("surfaces", picture.surfaces)):
+            for name, element in (("image", picture.image), ("closer", picture.closer)):
                 if element is not None:
                     file = folder / f"{name}-{frame}.svg"
                     file.write_text(drawing(element), encoding="utf-8")

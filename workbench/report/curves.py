@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -12,7 +11,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
-from pipelines.verdict import Severity, Verdict
+from pipelines.verdict import Verdict
 from workbench.runs import Run
 
 Floats = NDArray[np.float64]
@@ -57,6 +56,15 @@ class Chart:
     t_s: Floats
     curves: tuple[Curve, ...]
     from_zero: bool = False
+
+    def readable(self) -> Chart:
+        """The same in mm or µm where metres would be tiny."""
+        largest = max((float(np.nanmax(np.abs(c.values), initial=0.0)) for c in self.curves), default=0.0)
+        if self.unit != "m" or largest >= 0.1 or largest == 0:
+            return self
+        factor, unit = (1e3, "mm") if largest >= 1e-4 else (1e6, "µm")
+        curves = tuple(dataclasses.replace(curve, values=factor * curve.values) for curve in self.curves)
+        return dataclasses.replace(self, unit=unit, curves=curves)
 
     def thinned(self, most: int = MOST_POINTS) -> Chart:
         """The chart with at most that many points, the extremes of every curve among them."""
@@ -256,8 +264,3 @@ def _nis(run: Run, nis: Floats) -> Chart:
     curves = (Curve("mean NIS", mean), Curve("χ² low", low, "bound"), Curve("χ² high", high, "bound"))
     about = "Squared innovations over what the filter expects, mean of the frame's landmarks; the band holds 95 %."
     return Chart("nis", "Innovations (NIS)", "1", about, run.frames, seconds(run), curves, from_zero=True)
-
-
-def gravest(verdicts: Sequence[Verdict]) -> Severity:
-    """The gravest severity of some verdicts."""
-    return max((v.severity for v in verdicts), default=Severity.FINE)

@@ -391,26 +391,43 @@ def commands(facts: Facts, finding: Finding) -> list[str]:
     begin = max(first, finding.worst_frame - WINDOW_FRAMES // 2) - LEAD_FRAMES
     begin = max(begin, int(facts.run.frames[0]))
     stop = min(last, finding.worst_frame + WINDOW_FRAMES // 2) + LEAD_FRAMES
-    sets = "".join(f" --set {key}={value}" for key, value in trials(finding.remedy, facts.run.settings))
+    sets = "".join(f" --set {key}={value}" for key, value in trials(finding.remedy, facts.run))
     found = [f"workbench explain {run} --frame {finding.worst_frame}"]
     if sets:
         found.append(f"workbench whatif {run} --from {begin} --to {stop}{sets}")
     return found
 
 
-def trials(remedy: str, settings: Mapping[str, Any]) -> list[tuple[str, str]]:
-    """Settings that a remedy names, with a value to try: twice for "raise", half for "lower", the other of two."""
-    found = []
-    for match in re.finditer(r"(?:\b(raise|lower)\s+)?\b([a-z]\w*_\w+)\b", remedy):
-        direction, key = match.groups()
-        value = settings.get(key)
-        if isinstance(value, bool):
-            found.append((key, str(not value).lower()))
-        elif isinstance(value, int | float) and direction:
-            factor = 2 if direction == "raise" else 0.5
-            changed = type(value)(value * factor)
-            found.append((key, f"{changed:g}"))
-    return list(dict(found).items())
+def trials(remedy: str, run: Run) -> list[tuple[str, str]]:
+    """Settings that a remedy names, with a value to try: twice for "raise", half for "lower", the other of two.
+
+    Whatever the settings would refuse is left out.
+    """
+    found: dict[str, str] = {}
+    for direction, key in re.findall(r"(?:\b(raise|lower)\s+)?\b([a-z]\w*_\w+)\b", remedy):
+        value = run.settings.get(key)
+        tried = not value if isinstance(value, bool) else _tried(value, direction)
+        if tried is not None and _accepted(run, key, tried):
+            found[key] = str(tried).lower()
+    return list(found.items())
+
+
+def _tried(value: Any, direction: str) -> int | float | None:
+    """A number twice or half as large, an odd one odd again; None without a direction."""
+    if not direction or not isinstance(value, int | float):
+        return None
+    changed = value * (2.0 if direction == "raise" else 0.5)
+    if isinstance(value, float):
+        return float(f"{changed:.6g}")
+    return int(changed) | 1 if value % 2 else int(changed)
+
+
+def _accepted(run: Run, key: str, value: Any) -> bool:
+    try:
+        run.plugin.settings.model_validate({**run.settings, key: value})
+    except (ValueError, WorkbenchError):
+        return False
+    return True
 
 
 # ------------------------------------------------------------------------------ as values

@@ -210,9 +210,11 @@ def _evidence(evidence: Sequence[Evidence]) -> Element | None:
 def _pictures(picture: Picture | None) -> Element | None:
     if picture is None:
         return None
-    parts = ((picture.image, picture.caption), (picture.surfaces, picture.surfaces_caption))
+    parts = ((picture.image, picture.caption), (picture.closer, picture.closer_caption))
     figures = [el("figure", drawing, el("figcaption", text)) for drawing, text in parts if text]
-    return el("div", figures, class_="pictures")
+    columns = range(1, len(picture.heads))
+    table = _table(f"Numbers of frame {picture.frame}", picture.heads, picture.rows, columns) if picture.rows else None
+    return el("div", el("div", figures, class_="pictures"), table)
 
 
 # ------------------------------------------------------------------------------------ numbers
@@ -225,8 +227,8 @@ def _drift(facts: Facts) -> Element | None:
         return None
     shift, heading = (np.nancumsum(part) for part in (budget.shift_m, budget.heading_m))
     curves = (Curve("shift and heading", shift + heading), Curve("wrong shifts", shift), Curve("wrong turns", heading))
-    chart = Chart("drift", "Harm so far", "m", "What the frames up to here add to the end-point error.",
-                  facts.run.frames, seconds(facts.run), curves)  # fmt: skip
+    about = "What the frames up to here add to the end-point error."
+    chart = Chart("drift", "Harm so far", "m", about, facts.run.frames, seconds(facts.run), curves)
     told = (
         f"The end is {length(budget.end_error_m)} off: {length(float(np.nansum(budget.shift_m)))} by wrong shifts, "
         f"{length(float(np.nansum(budget.heading_m)))} by wrong turns carried to the end. {budget.about}"

@@ -6,6 +6,7 @@ Drawings carry their own colours, so that each also stands as a file of its own.
 from __future__ import annotations
 
 import base64
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
@@ -14,6 +15,7 @@ import cv2
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.ranging.filter import Outcome, Status
 from readers.streams import RecordingError, StreamError
 from workbench import traces
 from workbench.report.markup import Element, el
@@ -25,6 +27,10 @@ Floats = NDArray[np.float64]
 WIDEST_PX = 640
 JPEG_QUALITY = 80
 CANVAS_PX = (640.0, 480.0)
+CLOSE_PX = 32.0
+"""Half the width of a view from close by."""
+MOST_LANDMARKS = 24
+"""Landmarks in the table of a frame."""
 BLUE, YELLOW, RED, WHITE, GREEN = "#4fc3f7", "#ffd54f", "#ff5252", "#ffffff", "#00e676"
 
 _OVERLAY_FIELDS = (
@@ -32,6 +38,11 @@ _OVERLAY_FIELDS = (
     "tile_px", "tile_shift_px", "tile_weight",
 )  # fmt: skip
 _PEAK_FIELDS = ("peak_px", "second_peak_px", "peak_correlation", "second_peak_correlation", "peak_ratio")
+_FRAGMENT_FIELDS = (
+    "peak_correlation", "peak_ratio", "residual_rms", "condition", "weight", "shift_px", "fit_residual_px",
+)  # fmt: skip
+_LANDMARK_FIELDS = ("landmark_id", "status", "outcome", "range_m", "range_interval_m", "relative_sigma", "nis",
+                    "innovation_px", "measured_px")  # fmt: skip
 _DRAWN = {"measured": "Points2D:positions", "predicted": "Points2D:positions", "gate": "LineStrips2D:strips",
           "focus": "LineStrips2D:strips"}  # fmt: skip
 _ARROWS = ("Arrows2D:origins", "Arrows2D:vectors")
@@ -45,15 +56,19 @@ class Picture:
         frame: its number.
         image: the drawing with the image, or on a blank canvas; None where nothing was drawn.
         caption: what is on it.
-        surfaces: the correlation surfaces; None of an estimator or a frame without.
-        surfaces_caption: what is on them.
+        closer: the correlation surfaces, or the landmark that fits worst from close by; None where there is none.
+        closer_caption: what is on it.
+        heads: names of the columns of the frame's numbers.
+        rows: the numbers, one row a fragment or landmark.
     """
 
     frame: int
     image: Element | None
     caption: str
-    surfaces: Element | None = None
-    surfaces_caption: str = ""
+    closer: Element | None = None
+    closer_caption: str = ""
+    heads: tuple[str, ...] = ()
+    rows: tuple[tuple[str, ...], ...] = ()
 
 
 def pictures(run: Run, frames: Iterable[int]) -> dict[int, Picture]:
@@ -75,8 +90,16 @@ def pictures(run: Run, frames: Iterable[int]) -> dict[int, Picture]:
 # -------------------------------------------------------------------------------- the image
 
 
-def _image(run: Run, frame: int) -> tuple[list[Element], tuple[float, float] | None, str]:
-    """A frame's image as an element, its size, and a word where there is none."""
+def _image(
+    run: Run, frame: int, view: tuple[float, float, float, float] | None = None
+) -> tuple[list[Element], tuple[float, float] | None, str]:
+    """A frame's image as an element, its size, and a word where there is none.
+
+    Args:
+        run: the run.
+        frame: number of the frame.
+        view: x, y, width and height of the part that is wanted, at full size; the whole image otherwise.
+    """
     try:
         sample = run.image(frame)
         grey: NDArray[Any] | None = None if sample is None else sample.grey()
@@ -85,24 +108,32 @@ def _image(run: Run, frame: int) -> tuple[list[Element], tuple[float, float] | N
     if grey is None:
         return [], None, " The run holds no image of this frame."
     height, width = grey.shape
+    left, top, right, bottom = 0, 0, width, height
+    if view is not None:
+        left, top = (max(0, math.floor(v)) for v in view[:2])
+        right, bottom = (math.ceil(view[k] + view[k + 2]) for k in (0, 1))
+        grey = grey[top:bottom, left:right]
+    if not grey.size:
+        return [], None, ""
     if grey.dtype != np.uint8:
         grey = cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
-    if width > WIDEST_PX:
-        size = (WIDEST_PX, max(1, round(height * WIDEST_PX / width)))
-        grey = cv2.resize(grey, size, interpolation=cv2.INTER_AREA)
+    tall, wide = grey.shape
+    place = {"x": left, "y": top, "width": wide, "height": tall}
+    if wide > WIDEST_PX:
+        grey = cv2.resize(grey, (WIDEST_PX, max(1, round(tall * WIDEST_PX / wide))), interpolation=cv2.INTER_AREA)
     done, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
     if not done:
         return [], None, " The image could not be encoded."
-    return [_embedded(encoded.tobytes(), "jpeg", width, height)], (float(width), float(height)), ""
+    return [_embedded(encoded.tobytes(), "jpeg", place)], (float(width), float(height)), ""
 
 
-def _embedded(blob: bytes, form: str, width: float, height: float, **more: str) -> Element:
+def _embedded(blob: bytes, form: str, place: Mapping[str, float], **more: str) -> Element:
     uri = f"data:image/{form};base64,{base64.b64encode(blob).decode()}"
-    return el("image", href=uri, width=width, height=height, **more)
+    return el("image", href=uri, **place, **more)
 
 
-def _svg(size: tuple[float, float], label: str, *content: Any) -> Element:
-    return el("svg", *content, viewBox=f"0 0 {size[0]:g} {size[1]:g}", role="img", aria_label=label, class_="picture")
+def _svg(view: tuple[float, float, float, float], label: str, *content: Any) -> Element:
+    return el("svg", *content, viewBox=" ".join(f"{v:g}" for v in view), role="img", aria_label=label, class_="picture")
 
 
 def _hex(colour: int) -> str:
@@ -115,11 +146,11 @@ def _box(centre: Floats, half: Floats, colour: str, **more: str) -> Element:
               fill="none", stroke=colour, **more)  # fmt: skip
 
 
-def _arrow(start: Floats, vector: Floats, colour: str, width: str = "1.6") -> Element:
+def _arrow(start: Floats, vector: Floats, colour: str) -> Element:
     (u, v), (a, b) = start.tolist(), vector.tolist()
     return el(
         "g",
-        el("path", d=f"M{u:.1f} {v:.1f}l{a:.1f} {b:.1f}", stroke=colour, stroke_width=width, fill="none"),
+        el("path", d=f"M{u:.1f} {v:.1f}l{a:.1f} {b:.1f}", stroke=colour, stroke_width="1.6", fill="none"),
         el("circle", cx=f"{u + a:.1f}", cy=f"{v + b:.1f}", r="2.2", fill=colour),
     )
 
@@ -150,9 +181,26 @@ def _correlation(run: Run, frame: int, surface: NDArray[Any] | None) -> Picture:
         "trusted, red: not, grey: the frame was not accepted)."
     )
     blank = [] if picture else [el("rect", width=width, height=height, fill="#222222")]
-    image = _svg((width, height), f"image of frame {frame} with fragments and matches", blank, picture, marks)
+    image = _svg((0, 0, width, height), f"image of frame {frame} with fragments and matches", blank, picture, marks)
     surfaces, told = _surfaces(run, row, frame, surface)
-    return Picture(frame, image, caption + excuse, surfaces, told)
+    return Picture(frame, image, caption + excuse, surfaces, told, *_fragments(run, row))
+
+
+def _fragments(run: Run, row: int) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
+    """The numbers of a frame's fragments."""
+    here = {name: column[row] for name, column in run.columns(_FRAGMENT_FIELDS).items()}
+    shift, residual = here.pop("shift_px"), here.pop("fit_residual_px")
+    parts = [*here.values(), *shift.T, np.hypot(*residual.T)]
+    heads = ("fragment", "peak", "ratio", "residual", "condition", "weight", "shift u px", "shift v px", "misfit px")
+    return heads, _numbered(np.arange(1, len(shift) + 1), parts)
+
+
+def _numbered(first: Iterable[object], parts: Sequence[Floats]) -> tuple[tuple[str, ...], ...]:
+    """Rows of a table: a name and numbers."""
+    return tuple(
+        (str(name), *("" if math.isnan(v) else f"{v:.4g}" for v in values))
+        for name, *values in zip(first, *parts, strict=True)
+    )
 
 
 def _around(shapes: Mapping[str, traces.Shapes]) -> tuple[float, float]:
@@ -211,7 +259,7 @@ def _surfaces(run: Run, row: int, frame: int, stored: NDArray[Any] | None) -> tu
             el("circle", cx=f"{u:.1f}", cy=f"{v:.1f}", r="1.4", fill="none", stroke=colour, stroke_width="0.5")
             for u, v in points[np.isfinite(points).all(axis=1)].tolist()
         ]
-    image = _embedded(encoded.tobytes(), "png", width, height, image_rendering="pixelated")
+    image = _embedded(encoded.tobytes(), "png", {"width": width, "height": height}, image_rendering="pixelated")
     told = f"Correlation surfaces of frame {frame}, fragments as on the image (white: peak, red: second peak)."
     ratio = peaks["peak_ratio"]
     if np.isfinite(ratio).any():
@@ -221,7 +269,7 @@ def _surfaces(run: Run, row: int, frame: int, stored: NDArray[Any] | None) -> tu
             f"{peaks['second_peak_correlation'][k]:.3f}, ratio {ratio[k]:.3f}."
         )
     label = f"correlation surfaces of frame {frame}"
-    return _svg((float(width), float(height)), label, image, marks), told
+    return _svg((0, 0, width, height), label, image, marks), told
 
 
 def _side(size: int, rows: int, columns: int) -> int | None:
@@ -265,28 +313,79 @@ def _drawn(run: Run, frames: Sequence[int]) -> dict[int, dict[str, list[Any]]]:
 
 def _drawn_picture(run: Run, frame: int, drawn: Mapping[int, Mapping[str, list[Any]]]) -> Picture:
     here = drawn.get(frame, {})
-    points = [np.asarray(here.get(name, []), np.float64).reshape(-1, 2) for name in ("measured", "predicted")]
+    measured, predicted = (np.asarray(here.get(k, []), np.float64).reshape(-1, 2) for k in ("measured", "predicted"))
+    table, worst = _landmarks(run, run.row_of(frame))
     picture, size, excuse = _image(run, frame)
-    known = np.concatenate(points)
+    known = np.concatenate([measured, predicted])
     if size is None and not len(known):
-        return Picture(frame, None, f"Frame {frame}: no image, and no landmark on it." + excuse)
+        return Picture(frame, None, f"Frame {frame}: no landmark was measured or predicted." + excuse, None, "", *table)
     width, height = size or _canvas(run, known)
-    marks = [_line(strip, YELLOW) for strip in here.get("gate", [])]
-    marks += [_line(strip, GREEN) for strip in here.get("focus", [])]
-    marks += [
-        el("path", d=f"M{u - 4:.1f} {v:.1f}h8M{u:.1f} {v - 4:.1f}v8", stroke=BLUE, stroke_width="1.4", fill="none")
-        for u, v in points[1].tolist()
-    ]
-    marks += [el("circle", cx=f"{u:.1f}", cy=f"{v:.1f}", r="3", fill=RED) for u, v in points[0].tolist()]
-    origins, vectors = (np.asarray(part, np.float64).reshape(-1, 2) for part in here.get("innovation", ([], [])))
-    marks += [_arrow(o, v, WHITE, "1") for o, v in zip(origins, vectors, strict=True)]
     blank = [] if picture else [el("rect", width=width, height=height, fill="#222222")]
+    marks = _marks(here, measured, predicted)
     caption = (
         f"Frame {frame}: measured points (red), predicted ones (blue crosses), gates (yellow), innovations (white), "
         "focus of expansion (green)."
     )
-    image = _svg((width, height), f"image of frame {frame} with landmarks", blank, picture, marks)
-    return Picture(frame, image, caption + excuse)
+    image = _svg((0, 0, width, height), f"image of frame {frame} with landmarks", blank, picture, marks)
+    closer, told = None, ""
+    if worst is not None and len(measured):
+        u, v = measured[np.argmin(np.hypot(*(measured - worst[1]).T))]
+        view = (u - CLOSE_PX, v - 0.75 * CLOSE_PX, 2 * CLOSE_PX, 1.5 * CLOSE_PX)
+        told = f"The landmark whose innovation is the largest for its gate (number {worst[0]}), from close by."
+        part, _, _ = _image(run, frame, view)
+        plain = [el("rect", x=view[0], y=view[1], width=view[2], height=view[3], fill="#222222")]
+        marks = _marks(here, measured, predicted, fine=True)
+        closer = _svg(view, f"frame {frame} around landmark {worst[0]}", plain, part, marks)
+    return Picture(frame, image, caption + excuse, closer, told, *table)
+
+
+def _marks(here: Mapping[str, list[Any]], measured: Floats, predicted: Floats, *, fine: bool = False) -> list[Element]:
+    """Points, gates and innovations of a frame; `fine` for a view from close by."""
+    size, line = (0.8, "0.4") if fine else (4.0, "1.4")
+    marks = [_line(strip, YELLOW, line) for strip in here.get("gate", [])]
+    marks += [_line(strip, GREEN, line) for strip in here.get("focus", [])]
+    marks += [
+        el("path", d=f"M{u - size:.2f} {v:.2f}h{2 * size}M{u:.2f} {v - size:.2f}v{2 * size}", stroke=BLUE,
+           stroke_width=line, fill="none")
+        for u, v in predicted.tolist()
+    ]  # fmt: skip
+    marks += [el("circle", cx=f"{u:.2f}", cy=f"{v:.2f}", r=size, fill="none", stroke=RED, stroke_width=line)
+              for u, v in measured.tolist()]  # fmt: skip
+    origins, vectors = (np.asarray(part, np.float64).reshape(-1, 2) for part in here.get("innovation", ([], [])))
+    marks += [
+        el("path", d=f"M{u:.2f} {v:.2f}l{a:.2f} {b:.2f}", stroke=WHITE, stroke_width=line, fill="none")
+        for (u, v), (a, b) in zip(origins.tolist(), vectors.tolist(), strict=True)
+    ]
+    return marks
+
+
+def _landmarks(run: Run, row: int) -> tuple[tuple[tuple[str, ...], tuple[tuple[str, ...], ...]],
+                                            tuple[int, Floats] | None]:  # fmt: skip
+    """The numbers of a frame's landmarks; number and image point of the one with the largest NIS, where one is."""
+    here = {name: column[row] for name, column in run.columns(_LANDMARK_FIELDS).items()}
+    carried = np.flatnonzero(np.isfinite(here["landmark_id"]))[:MOST_LANDMARKS]
+    here = {name: values[carried] for name, values in here.items()}
+    names = [
+        f"{int(k)} ({_word(Status, s)}, {_word(Outcome, o)})"
+        for k, s, o in zip(here["landmark_id"], here["status"], here["outcome"], strict=True)
+    ]
+    parts = [
+        here["range_m"],
+        *here["range_interval_m"].T,
+        here["relative_sigma"],
+        here["nis"],
+        *here["innovation_px"].T,
+    ]
+    heads = ("landmark", "Z m", "nearest m", "farthest m", "σ_ξ/ξ", "NIS", "ν x px", "ν y px")
+    table = (heads, _numbered(names, parts))
+    if not np.isfinite(here["nis"]).any():
+        return table, None
+    k = int(np.nanargmax(here["nis"]))
+    return table, (int(here["landmark_id"][k]), here["measured_px"][k])
+
+
+def _word(kind: type[Status] | type[Outcome], value: float) -> str:
+    return kind(int(value)).name.lower() if math.isfinite(value) else "none"
 
 
 def _canvas(run: Run, points: Floats) -> tuple[float, float]:
@@ -298,6 +397,6 @@ def _canvas(run: Run, points: Floats) -> tuple[float, float]:
     return float(width), float(height)
 
 
-def _line(points: Iterable[Iterable[float]], colour: str) -> Element:
-    text = "L".join(f"{u:.1f} {v:.1f}" for u, v in points)
-    return el("path", d=f"M{text}", stroke=colour, stroke_width="1", fill="none")
+def _line(points: Iterable[Iterable[float]], colour: str, width: str) -> Element:
+    text = "L".join(f"{u:.2f} {v:.2f}" for u, v in points)
+    return el("path", d=f"M{text}", stroke=colour, stroke_width=width, fill="none")

@@ -69,7 +69,7 @@ def number(value: float) -> str:
 
 def chart_plot(chart: Chart, findings: Sequence[Finding]) -> Element:
     """A plot over the frames with the findings' frames shaded."""
-    thin = chart.thinned()
+    thin = chart.readable().thinned()
     x = frame_axis(thin.frame)
     y = value_axis((curve.values for curve in thin.curves), from_zero=chart.from_zero)
     at = x(thin.frame.astype(np.float64))
@@ -83,10 +83,10 @@ def chart_plot(chart: Chart, findings: Sequence[Finding]) -> Element:
         "t": _rounded(thin.t_s, 3),
         "x": [x.low, x.high],
         "y": [y.low, y.high],
-        "unit": "" if chart.unit == "1" else chart.unit,
+        "unit": "" if thin.unit == "1" else thin.unit,
         "lines": [{"name": c.name, "values": _significant(c.values), "dot": c.role != "bound"} for c in thin.curves],
     }
-    unit = "" if chart.unit == "1" else f", {chart.unit}"
+    unit = "" if thin.unit == "1" else f", {thin.unit}"
     body = [shades(findings, x), grid(x, y), lines, cursor(sum(c.role != "bound" for c in thin.curves))]
     return figure(chart.key, chart.title + unit, chart.about, data, body, x, y, "frame", legend(chart))
 
@@ -116,7 +116,7 @@ def strip_plot(strip: Strip, findings: Sequence[Finding]) -> Element:
     }
     about = "The gravest verdict of each stretch of frames: the graver, the higher."
     body = [shades(findings, x), bars, cursor(0)]
-    kinds = [(s.name.lower(), f"severity {s.name.lower()}") for s in Severity if s in severities]
+    kinds = [(f"severity {s.name.lower()}", s.name.lower()) for s in Severity if s in severities]
     return figure("verdicts", "Verdicts", about, data, body, x, None, "frame", _keys(kinds))
 
 
