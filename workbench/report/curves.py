@@ -227,7 +227,7 @@ def _range(run: Run) -> list[Chart]:
     charts = [chart for k in shown for chart in _slot(run, k)]
     charts.append(_nis(run, nis))
     about = "σ_ξ/ξ of the landmark in each slot: what the filter believes to know of its range." + more
-    lines = tuple(Curve(f"slot {k}", np.where(np.isfinite(sigma[:, k]), sigma[:, k], np.nan)) for k in shown)
+    lines = tuple(Curve(f"slot {k + 1}", np.where(np.isfinite(sigma[:, k]), sigma[:, k], np.nan)) for k in shown)
     if lines:
         charts.append(Chart("relative-sigma", "Relative uncertainty", "1", about, frames, t_s, lines, from_zero=True))
     return charts
@@ -237,7 +237,7 @@ def _slot(run: Run, slot: int) -> list[Chart]:
     """Range of the landmark in a slot against the reference, as the replay logged it."""
     from workbench.rrd_reading import series
 
-    found = series(run.file, f"{run.root}/landmark/{slot}/range", "Scalars:scalars")
+    found = series(run.file, f"{run.root}/landmark/{slot + 1}/range", "Scalars:scalars")
     if not len(found.frame):
         return []
     values = np.full((len(run.frames), found.values.shape[1]), np.nan)
@@ -250,8 +250,8 @@ def _slot(run: Run, slot: int) -> list[Chart]:
     if np.isfinite(reference).any():
         curves.append(Curve("reference", reference, "reference"))
     about = "Depth along the optical axis, with what ± 2 σ_ξ leaves open, against the reference where there is one."
-    title = f"Range of the landmark in slot {slot}"
-    return [Chart(f"range-{slot}", title, "m", about, run.frames, seconds(run), tuple(curves), from_zero=True)]
+    title = f"Range of the landmark in slot {slot + 1}"
+    return [Chart(f"range-{slot + 1}", title, "m", about, run.frames, seconds(run), tuple(curves), from_zero=True)]
 
 
 def _nis(run: Run, nis: Floats) -> Chart:

@@ -67,6 +67,30 @@ class Drift:
     end_error_m: float
     about: str = ""
 
+    @classmethod
+    def of_rows(
+        cls,
+        count: int,
+        rows: NDArray[np.int64],
+        shift_m: Floats,
+        heading_m: Floats,
+        end_error_m: float,
+        about: str = "",
+    ) -> Drift:
+        """The budget of a run of `count` frames, given for some of its rows [m] only.
+
+        Args:
+            count: frames of the run.
+            rows: which of them have a share, ascending.
+            shift_m: their shares of wrong shifts along the end-point error.
+            heading_m: those of wrong turns.
+            end_error_m: length of the end-point error.
+            about: how to read it.
+        """
+        shift, heading = np.full((2, count), np.nan)
+        shift[rows], heading[rows] = shift_m, heading_m
+        return cls(shift_m=shift, heading_m=heading, end_error_m=end_error_m, about=about)
+
     @property
     def harm_m(self) -> Floats:
         """Shift and heading together [n]."""
@@ -142,6 +166,7 @@ def facts_of(
     Raises:
         RecordingError: the run's own file cannot be read.
     """
+    run.columns(run.fields)  # at once: a file with a torn end is mended anew for each reading
     missing = _missing(run)
     rows = len(run.frames)
     found: Sequence[Finding] = ()

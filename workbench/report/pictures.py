@@ -23,6 +23,7 @@ from workbench.runs import Run
 from workbench.schema import Archetype
 
 Floats = NDArray[np.float64]
+Grey = NDArray[np.uint8]
 
 WIDEST_PX = 640
 JPEG_QUALITY = 80
@@ -80,51 +81,61 @@ def pictures(run: Run, frames: Iterable[int]) -> dict[int, Picture]:
     wanted = sorted(set(frames) & set(run.frames.tolist()))
     if not wanted:
         return {}
+    images = _greys(run, wanted)
     if run.estimator == "correlation":
         stored = _stored_surfaces(run, wanted)
-        return {frame: _correlation(run, frame, stored.get(frame)) for frame in wanted}
+        return {frame: _correlation(run, frame, images[frame], stored.get(frame)) for frame in wanted}
     drawn = _drawn(run, wanted)
-    return {frame: _drawn_picture(run, frame, drawn) for frame in wanted}
+    return {frame: _drawn_picture(run, frame, images[frame], drawn) for frame in wanted}
 
 
 # -------------------------------------------------------------------------------- the image
 
 
-def _image(
-    run: Run, frame: int, view: tuple[float, float, float, float] | None = None
-) -> tuple[list[Element], tuple[float, float] | None, str]:
-    """A frame's image as an element, its size, and a word where there is none.
-
-    Args:
-        run: the run.
-        frame: number of the frame.
-        view: x, y, width and height of the part that is wanted, at full size; the whole image otherwise.
-    """
+def _greys(run: Run, frames: Sequence[int]) -> dict[int, Grey | str]:
+    """The grey images of some frames, or a sentence on why there is none."""
     try:
-        sample = run.image(frame)
-        grey: NDArray[Any] | None = None if sample is None else sample.grey()
-    except (RecordingError, StreamError) as error:
-        return [], None, f" There is no image: {error}."
-    if grey is None:
-        return [], None, " The run holds no image of this frame."
-    height, width = grey.shape
-    left, top, right, bottom = 0, 0, width, height
+        samples = run.images(frames)
+    except RecordingError as error:
+        return dict.fromkeys(frames, f" There is no image: {error}.")
+    found: dict[int, Grey | str] = dict.fromkeys(frames, " The run holds no image of this frame.")
+    for frame, sample in samples.items():
+        try:
+            found[frame] = _eight_bits(sample.grey())
+        except StreamError as error:
+            found[frame] = f" There is no image: {error}."
+    return found
+
+
+def _eight_bits(grey: NDArray[Any]) -> Grey:
+    """An image with 8 bits a pixel; deeper ones are stretched over them."""
+    if grey.dtype == np.uint8:
+        return np.asarray(grey, np.uint8)
+    return np.asarray(cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U), np.uint8)
+
+
+def _shown(grey: Grey | str, view: tuple[float, float, float, float] | None = None) -> list[Element]:
+    """An image, or the part x, y, width, height of it; nothing where there is none."""
+    if isinstance(grey, str):
+        return []
+    left = top = 0
     if view is not None:
         left, top = (max(0, math.floor(v)) for v in view[:2])
-        right, bottom = (math.ceil(view[k] + view[k + 2]) for k in (0, 1))
+        right, bottom = (max(0, math.ceil(view[k] + view[k + 2])) for k in (0, 1))
         grey = grey[top:bottom, left:right]
     if not grey.size:
-        return [], None, ""
-    if grey.dtype != np.uint8:
-        grey = cv2.normalize(grey, None, 0, 255, cv2.NORM_MINMAX, cv2.CV_8U)
+        return []
     tall, wide = grey.shape
     place = {"x": left, "y": top, "width": wide, "height": tall}
     if wide > WIDEST_PX:
-        grey = cv2.resize(grey, (WIDEST_PX, max(1, round(tall * WIDEST_PX / wide))), interpolation=cv2.INTER_AREA)
-    done, encoded = cv2.imencode(".jpg", grey, [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY])
-    if not done:
-        return [], None, " The image could not be encoded."
-    return [_embedded(encoded.tobytes(), "jpeg", place)], (float(width), float(height)), ""
+        small = cv2.resize(grey, (WIDEST_PX, max(1, round(tall * WIDEST_PX / wide))), interpolation=cv2.INTER_AREA)
+        grey = np.asarray(small, np.uint8)
+    return [_embedded(_encoded(grey, ".jpg", [cv2.IMWRITE_JPEG_QUALITY, JPEG_QUALITY]), "jpeg", place)]
+
+
+def _encoded(image: NDArray[np.uint8], ending: str, options: Sequence[int] = ()) -> bytes:
+    _, encoded = cv2.imencode(ending, image, list(options))
+    return bytes(encoded.tobytes())
 
 
 def _embedded(blob: bytes, form: str, place: Mapping[str, float], **more: str) -> Element:
@@ -134,6 +145,14 @@ def _embedded(blob: bytes, form: str, place: Mapping[str, float], **more: str) -
 
 def _svg(view: tuple[float, float, float, float], label: str, *content: Any) -> Element:
     return el("svg", *content, viewBox=" ".join(f"{v:g}" for v in view), role="img", aria_label=label, class_="picture")
+
+
+def _blank(x: float, y: float, width: float, height: float) -> Element:
+    return el("rect", x=x, y=y, width=width, height=height, fill="#222222")
+
+
+def _excuse(grey: Grey | str) -> str:
+    return grey if isinstance(grey, str) else ""
 
 
 def _hex(colour: int) -> str:
@@ -158,12 +177,11 @@ def _arrow(start: Floats, vector: Floats, colour: str) -> Element:
 # -------------------------------------------------------------------------------- correlation
 
 
-def _correlation(run: Run, frame: int, surface: NDArray[Any] | None) -> Picture:
+def _correlation(run: Run, frame: int, grey: Grey | str, surface: NDArray[Any] | None) -> Picture:
     row = run.row_of(frame)
     table = {name: column[row : row + 1] for name, column in run.columns(_OVERLAY_FIELDS).items()}
     shapes = traces.overlays(table)
-    picture, size, excuse = _image(run, frame)
-    width, height = size or _around(shapes)
+    width, height = _around(shapes) if isinstance(grey, str) else grey.shape[::-1]
     marks: list[Element] = [
         _box(c, h, BLUE, stroke_width="1", stroke_dasharray="4 3")
         for c, h in zip(shapes["search"].points, shapes["search"].extents, strict=True)
@@ -180,10 +198,10 @@ def _correlation(run: Run, frame: int, surface: NDArray[Any] | None) -> Picture:
         f"Frame {frame}: fragments of the template (white), search areas (blue, dashed), matches and shifts (green: "
         "trusted, red: not, grey: the frame was not accepted)."
     )
-    blank = [] if picture else [el("rect", width=width, height=height, fill="#222222")]
-    image = _svg((0, 0, width, height), f"image of frame {frame} with fragments and matches", blank, picture, marks)
+    label = f"image of frame {frame} with fragments and matches"
+    image = _svg((0, 0, width, height), label, _blank(0, 0, width, height), _shown(grey), marks)
     surfaces, told = _surfaces(run, row, frame, surface)
-    return Picture(frame, image, caption + excuse, surfaces, told, *_fragments(run, row))
+    return Picture(frame, image, caption + _excuse(grey), surfaces, told, *_fragments(run, row))
 
 
 def _fragments(run: Run, row: int) -> tuple[tuple[str, ...], tuple[tuple[str, ...], ...]]:
@@ -246,10 +264,7 @@ def _surfaces(run: Run, row: int, frame: int, stored: NDArray[Any] | None) -> tu
     if side is None or not np.isfinite(stored).any():
         return None, "The correlation surfaces of this frame hold no number."
     height, width = rows * (side + 1) - 1, columns * (side + 1) - 1
-    picture = _heat(stored.reshape(height, width).astype(np.float64))
-    done, encoded = cv2.imencode(".png", picture)
-    if not done:
-        return None, "The correlation surfaces could not be encoded."
+    heat = _encoded(_heat(stored.reshape(height, width).astype(np.float64)), ".png")
     corners = at[:, ::-1] * (side + 1)
     centre = here["search_centre_px"] - here["fragment_px"]
     marks = []
@@ -259,7 +274,7 @@ def _surfaces(run: Run, row: int, frame: int, stored: NDArray[Any] | None) -> tu
             el("circle", cx=f"{u:.1f}", cy=f"{v:.1f}", r="1.4", fill="none", stroke=colour, stroke_width="0.5")
             for u, v in points[np.isfinite(points).all(axis=1)].tolist()
         ]
-    image = _embedded(encoded.tobytes(), "png", {"width": width, "height": height}, image_rendering="pixelated")
+    image = _embedded(heat, "png", {"width": width, "height": height}, image_rendering="pixelated")
     told = f"Correlation surfaces of frame {frame}, fragments as on the image (white: peak, red: second peak)."
     ratio = peaks["peak_ratio"]
     if np.isfinite(ratio).any():
@@ -311,32 +326,30 @@ def _drawn(run: Run, frames: Sequence[int]) -> dict[int, dict[str, list[Any]]]:
     return found
 
 
-def _drawn_picture(run: Run, frame: int, drawn: Mapping[int, Mapping[str, list[Any]]]) -> Picture:
+def _drawn_picture(run: Run, frame: int, grey: Grey | str, drawn: Mapping[int, Mapping[str, list[Any]]]) -> Picture:
     here = drawn.get(frame, {})
     measured, predicted = (np.asarray(here.get(k, []), np.float64).reshape(-1, 2) for k in ("measured", "predicted"))
     table, worst = _landmarks(run, run.row_of(frame))
-    picture, size, excuse = _image(run, frame)
     known = np.concatenate([measured, predicted])
-    if size is None and not len(known):
-        return Picture(frame, None, f"Frame {frame}: no landmark was measured or predicted." + excuse, None, "", *table)
-    width, height = size or _canvas(run, known)
-    blank = [] if picture else [el("rect", width=width, height=height, fill="#222222")]
+    if isinstance(grey, str) and not len(known):
+        told = f"Frame {frame}: no landmark was measured or predicted.{grey}"
+        return Picture(frame, None, told, None, "", *table)
+    width, height = _canvas(run, known) if isinstance(grey, str) else grey.shape[::-1]
     marks = _marks(here, measured, predicted)
     caption = (
         f"Frame {frame}: measured points (red), predicted ones (blue crosses), gates (yellow), innovations (white), "
         "focus of expansion (green)."
     )
-    image = _svg((0, 0, width, height), f"image of frame {frame} with landmarks", blank, picture, marks)
+    label = f"image of frame {frame} with landmarks"
+    image = _svg((0, 0, width, height), label, _blank(0, 0, width, height), _shown(grey), marks)
     closer, told = None, ""
     if worst is not None and len(measured):
         u, v = measured[np.argmin(np.hypot(*(measured - worst[1]).T))]
         view = (u - CLOSE_PX, v - 0.75 * CLOSE_PX, 2 * CLOSE_PX, 1.5 * CLOSE_PX)
         told = f"The landmark whose innovation is the largest for its gate (number {worst[0]}), from close by."
-        part, _, _ = _image(run, frame, view)
-        plain = [el("rect", x=view[0], y=view[1], width=view[2], height=view[3], fill="#222222")]
         marks = _marks(here, measured, predicted, fine=True)
-        closer = _svg(view, f"frame {frame} around landmark {worst[0]}", plain, part, marks)
-    return Picture(frame, image, caption + excuse, closer, told, *table)
+        closer = _svg(view, f"frame {frame} around landmark {worst[0]}", _blank(*view), _shown(grey, view), marks)
+    return Picture(frame, image, caption + _excuse(grey), closer, told, *table)
 
 
 def _marks(here: Mapping[str, list[Any]], measured: Floats, predicted: Floats, *, fine: bool = False) -> list[Element]:
@@ -351,7 +364,8 @@ def _marks(here: Mapping[str, list[Any]], measured: Floats, predicted: Floats, *
     ]  # fmt: skip
     marks += [el("circle", cx=f"{u:.2f}", cy=f"{v:.2f}", r=size, fill="none", stroke=RED, stroke_width=line)
               for u, v in measured.tolist()]  # fmt: skip
-    origins, vectors = (np.asarray(part, np.float64).reshape(-1, 2) for part in here.get("innovation", ([], [])))
+    arrows = here.get("innovation", [[], []])
+    origins, vectors = (np.asarray(arrows[k], np.float64).reshape(-1, 2) for k in (0, 1))
     marks += [
         el("path", d=f"M{u:.2f} {v:.2f}l{a:.2f} {b:.2f}", stroke=WHITE, stroke_width=line, fill="none")
         for (u, v), (a, b) in zip(origins.tolist(), vectors.tolist(), strict=True)

@@ -37,7 +37,8 @@ def _blocks(facts: Facts, pictures: Mapping[int, Sequence[str]]) -> Iterable[str
                f"{length(heading)} by wrong turns.")  # fmt: skip
     yield "### Findings"
     yield from _findings(facts, pictures)
-    yield f"Recording SHA-256 `{facts.run.digest[:16]}…`; " + ", ".join(f"{k} {v}" for k, v in facts.versions[:3])
+    versions = ", ".join(plain(f"{name} {version}") for name, version in facts.versions[:3])
+    yield f"Recording SHA-256 {_code(facts.run.digest[:16])}…; {versions}"
 
 
 def _findings(facts: Facts, pictures: Mapping[int, Sequence[str]]) -> Iterable[str]:
