@@ -122,10 +122,16 @@ def test_error_curve_has_the_largest_error_of_the_summary(replayed: Run, facts: 
     np.testing.assert_allclose(distance, chart.curves[0].values, atol=1e-9)
 
 
-def test_upshot_is_grave_with_an_error_and_with_a_killed_replay(replayed: Run, tmp_path: Path) -> None:
+def test_upshot_is_grave_with_an_error_a_far_end_or_a_killed_replay(replayed: Run, tmp_path: Path) -> None:
     fine = report.facts_of(replayed, findings=[])
     assert fine.gravity is Severity.FINE
     assert report.facts_of(replayed, findings=[finding(severity=Severity.ERROR)]).gravity is Severity.ERROR
+    far = other_run(replayed, tmp_path / "far", summary={
+        "evaluation": {**replayed.summary["evaluation"], "drift_percent": 58.0, "end_error_m": 2.33}
+    })  # fmt: skip
+    told = report.facts_of(far, findings=[])
+    assert told.gravity is Severity.ERROR
+    assert told.upshot.startswith("do not trust this path: the end is 2.33 m off, 58 % of the path; ")
     killed = other_run(replayed, tmp_path / "killed", complete=False, summary=None)
     assert report.facts_of(killed, findings=[]).gravity is Severity.WARNING
 
@@ -309,6 +315,7 @@ def test_killed_run_without_sensors_tells_what_is_missing(replayed: Run, tmp_pat
     assert "incomplete: the replay was killed before its end" in page
     assert "sensors.rrd is not beside the run" in page
     assert "The run holds no image of this frame" in page
+    assert page.count("Not known: the replay did not come to its end.") == 2
     assert facts.metrics == []
 
 
@@ -316,7 +323,9 @@ def test_damaged_sensors_leave_the_rest(replayed: Run, tmp_path: Path) -> None:
     damaged = other_run(replayed, tmp_path / "damaged")
     damaged.sensors_file.write_bytes(b"nothing of the kind")
     facts = report.facts_of(open_run(damaged.folder), findings=[finding()])
-    assert any("sensors.rrd" in line for line in facts.missing)
+    assert any(line.startswith("the path: ") and "sensors.rrd" in line for line in facts.missing)
+    seen = report.facts_of(open_run(damaged.folder))
+    assert any(line.startswith("the reference: ") for line in seen.missing)
     assert "There is no image" in Page(report.page_of(facts)).text
 
 

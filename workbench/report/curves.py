@@ -22,6 +22,9 @@ MOST_POINTS = 2000
 MOST_SLOTS = 8
 """Slots of landmarks that have curves."""
 BAND = 0.95
+"""Share of a right filter's frames whose mean NIS lies between its bounds."""
+CUT = 3.0
+"""Ranges so many times the usual one, as a start has them, leave the plot."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -46,6 +49,7 @@ class Chart:
         t_s: seconds since the first frame [n].
         curves: lines, values [n] each.
         from_zero: whether its axis begins at zero.
+        ceiling: where its axis ends at the latest; what lies above leaves the plot.
     """
 
     key: str
@@ -56,6 +60,7 @@ class Chart:
     t_s: Floats
     curves: tuple[Curve, ...]
     from_zero: bool = False
+    ceiling: float = math.inf
 
     def readable(self) -> Chart:
         """The same in mm or µm where metres would be tiny."""
@@ -245,13 +250,15 @@ def _slot(run: Run, slot: int) -> list[Chart]:
     good = run.frames[rows] == found.frame
     values[rows[good]] = found.values[good]
     depth, near, far, reference = values.T[:4]
-    far = np.where(far < 5 * np.nanmax(np.where(np.isfinite(depth), depth, np.nan)), far, np.nan)
+    known = reference if np.isfinite(reference).any() else depth
+    ceiling = CUT * float(np.nanpercentile(known, 90)) if np.isfinite(known).any() else math.inf
     curves = [Curve("range Z", depth), Curve("nearest (2σ)", near, "bound"), Curve("farthest (2σ)", far, "bound")]
     if np.isfinite(reference).any():
         curves.append(Curve("reference", reference, "reference"))
-    about = "Depth along the optical axis, with what ± 2 σ_ξ leaves open, against the reference where there is one."
+    about = "Depth along the optical axis, with what ± 2 σ_ξ leaves open; the wild ranges of a start leave the plot."
     title = f"Range of the landmark in slot {slot + 1}"
-    return [Chart(f"range-{slot + 1}", title, "m", about, run.frames, seconds(run), tuple(curves), from_zero=True)]
+    key = f"range-{slot + 1}"
+    return [Chart(key, title, "m", about, run.frames, seconds(run), tuple(curves), from_zero=True, ceiling=ceiling)]
 
 
 def _nis(run: Run, nis: Floats) -> Chart:

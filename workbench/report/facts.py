@@ -11,7 +11,7 @@ import time
 from collections import Counter
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
+from pathlib import Path, PurePath
 from typing import Any, TypeVar
 
 import numpy as np
@@ -23,18 +23,22 @@ from workbench.diagnosis import diagnose
 from workbench.diagnosis.finding import Case, Finding
 from workbench.report import curves
 from workbench.runs import Run
+from workbench.summary import NOTABLE_DRIFT
 
 Floats = NDArray[np.float64]
 T = TypeVar("T")
 
 EPOCH_NS = 100_000_000_000_000_000
+"""Times from here on are dates."""
 WINDOW_FRAMES = 100
+"""Frames of a finding that are proposed for a replay."""
 LEAD_FRAMES = 10
+"""Frames before and behind them."""
 
 
 @dataclass(frozen=True, slots=True)
 class Metric:
-    """A row of numbers: RMS, mean, median, largest and last value of an error, NaN where there is none."""
+    """A row of numbers: RMS, mean, median and largest of an error, or a single `value`; NaN where there is none."""
 
     name: str
     unit: str
@@ -151,6 +155,11 @@ class Facts:
     strip: curves.Strip = field(repr=False)
     run: Run = field(repr=False)
 
+    @property
+    def title(self) -> str:
+        """Mission and run in a line."""
+        return f"{PurePath(self.recording).name or self.recording}: run {self.name}"
+
 
 def facts_of(
     run: Run, path: str | None = None, *, findings: Sequence[Finding] | None = None, drift: Drift | None = None
@@ -168,13 +177,8 @@ def facts_of(
     """
     run.columns(run.fields)  # at once: a file with a torn end is mended anew for each reading
     missing = _missing(run)
-    rows = len(run.frames)
-    found: Sequence[Finding] = ()
-    if findings is not None:
-        found = findings
-    else:
-        harm = None if drift is None else drift.harm_m
-        found = _attempt(lambda: diagnose(Case.of_run(run, harm)), [], "findings", missing)
+    harm = None if drift is None else drift.harm_m
+    found = diagnose(_case(run, harm, missing)) if findings is None else findings
     no_charts: list[curves.Chart] = []
     charts = [*_attempt(lambda: curves.errors(run), no_charts, "errors", missing), *curves.own(run)]
     paths = _attempt(lambda: curves.ways(run), None, "the path", missing)
@@ -186,7 +190,7 @@ def facts_of(
         path=path or str(run.file),
         upshot=upshot,
         gravity=gravity,
-        about=_about(run, rows),
+        about=_about(run),
         missing=missing,
         settings=[(k, _shown(here), _shown(usual)) for k, (here, usual) in _changed(run, missing).items()],
         advice=list(summary.get("suitability", ())),
@@ -207,6 +211,24 @@ def facts_of(
     )
 
 
+def _case(run: Run, harm_m: Floats | None, missing: list[str]) -> Case:
+    """What the diagnosis looks at; without the reference where its file cannot be read."""
+    case = _attempt(lambda: Case.of_run(run, harm_m), None, "the reference", missing)
+    if case is not None:
+        return case
+    nothing = np.full((len(run.frames), 4), np.nan)
+    return Case(
+        estimator=run.estimator,
+        settings=run.settings,
+        frame=run.frames,
+        t_ns=run.t_ns,
+        reference=nothing[:, :3],
+        harm_m=nothing[:, 3] if harm_m is None else harm_m,
+        facts=tuple(run.summary.get("facts", ())),
+        get=run.column,
+    )
+
+
 def _attempt(make: Callable[[], T], instead: T, what: str, missing: list[str]) -> T:
     """What `make` gives; where a file cannot be read `instead`, and a line among what is missing."""
     try:
@@ -221,27 +243,31 @@ def _attempt(make: Callable[[], T], instead: T, what: str, missing: list[str]) -
 
 def _upshot(run: Run, findings: Sequence[Finding]) -> tuple[str, Severity]:
     """The verdict on a run in a sentence, and how grave it is."""
-    errors = [f for f in findings if f.severity is Severity.ERROR]
-    warnings = [f for f in findings if f.severity is Severity.WARNING]
+    counts = Counter(finding.severity for finding in findings)
     said = next(iter(run.summary.get("suitability", ())), "")
-    end = run.summary.get("evaluation", {}).get("end_error_m", math.nan)
     parts = [said] if said else []
-    if math.isfinite(end):
-        share = run.summary["evaluation"]["drift_percent"]
-        parts.append(f"the end is {length(end)} off, {share:.3g} % of the path")
-    if not run.complete:
-        parts.insert(0, "incomplete: the replay was killed before its end")
-    elif run.summary.get("interrupted"):
-        parts.insert(0, "in part: the replay was stopped before the recording's end")
-    if run.summary.get("stopped_early"):
-        parts.insert(0, f"in part: {run.summary['stopped_early']}")
+    evaluation = run.summary.get("evaluation", {})
+    far = evaluation.get("drift_percent", 0.0) > 100 * NOTABLE_DRIFT
+    if math.isfinite(evaluation.get("end_error_m", math.nan)):
+        end = f"the end is {length(evaluation['end_error_m'])} off, {evaluation['drift_percent']:.3g} % of the path"
+        parts.insert(*((0, f"do not trust this path: {end}") if far else (1, end)))
+    parts = [*_cut_short(run), *parts]
     if findings:
-        parts.append(f"{_many(len(errors), 'error')} and {_many(len(warnings), 'warning')} found")
+        parts.append("found: " + ", ".join(_many(counts[s], s.name.lower()) for s in sorted(counts, reverse=True)))
     text = "; ".join(parts) or "the replay concluded nothing"
-    if said.startswith(("do not trust", "no range counts")) or errors:
+    if far or counts[Severity.ERROR] or said.startswith(("do not trust", "no range counts")):
         return text, Severity.ERROR
-    doubtful = bool(warnings) or "look at what follows" in said or not run.complete
+    doubtful = counts[Severity.WARNING] > 0 or "look at what follows" in said or bool(_cut_short(run))
     return text, Severity.WARNING if doubtful else Severity.FINE
+
+
+def _cut_short(run: Run) -> list[str]:
+    """Why a run does not reach the recording's end, where it does not."""
+    if not run.complete:
+        return ["incomplete: the replay was killed before its end"]
+    if run.summary.get("stopped_early"):
+        return [f"in part: {run.summary['stopped_early']}"]
+    return ["in part: the replay was stopped before the recording's end"] * bool(run.summary.get("interrupted"))
 
 
 def _many(count: int, thing: str) -> str:
@@ -289,7 +315,7 @@ def _shown(value: Any) -> str:
     return "not set" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
 
-def _about(run: Run, rows: int) -> list[tuple[str, str]]:
+def _about(run: Run) -> list[tuple[str, str]]:
     """Facts of mission and run."""
     summary, asked = run.summary, run.toml["run"]
     span_s = float(run.t_ns[-1] - run.t_ns[0]) / 1e9
@@ -297,7 +323,7 @@ def _about(run: Run, rows: int) -> list[tuple[str, str]]:
         ("recording", f"{asked.get('recording', '?')} ({summary['format']})" if "format" in summary else
          str(asked.get("recording", "?"))),
         ("run", f"{run.name}: estimator {run.estimator}, preset {run.preset}"),
-        ("frames", f"{rows}, numbers {run.frames[0]} to {run.frames[-1]}, over {span_s:.3f} s"),
+        ("frames", f"{len(run.frames)}, numbers {run.frames[0]} to {run.frames[-1]}, over {span_s:.3f} s"),
         ("begins", moment(int(run.t_ns[0]))),
         ("images", str(asked.get("image_stream") or "none")),
         ("reference", str(summary.get("reference") or asked.get("reference_stream") or "none")),

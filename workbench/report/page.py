@@ -35,7 +35,6 @@ def html(facts: Facts, pictures: Mapping[int, Picture]) -> str:
     """The page of a run, with the pictures of some frames."""
     style, script = (resources.files(__package__).joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
     sections = [section for section in _sections(facts, pictures) if section is not None]
-    title = f"{facts.recording}: run {facts.name}"
     spans = json.dumps([[f.rule, [list(span) for span in f.spans]] for f in facts.findings], separators=(",", ":"))
     root = el(
         "html",
@@ -45,13 +44,13 @@ def html(facts: Facts, pictures: Mapping[int, Picture]) -> str:
             el("meta", http_equiv="Content-Security-Policy", content=_policy(style, script)),
             el("meta", name="viewport", content="width=device-width, initial-scale=1"),
             el("meta", name="color-scheme", content="light dark"),
-            el("title", title),
+            el("title", facts.title),
             el("style", style),
         ),
         el(
             "body",
             el("a", "Skip to the report", href="#verdict", class_="skip"),
-            el("header", el("p", "Estimator workbench: report of a run", class_="kind"), el("h1", title)),
+            el("header", el("p", "Estimator workbench: report of a run", class_="kind"), el("h1", facts.title)),
             el("nav", el("ul", [el("li", el("a", _heading(s), href=f"#{s.get('id')}")) for s in sections]),
                aria_label="Contents"),
             el("main", sections),
@@ -110,6 +109,7 @@ def _sections(facts: Facts, pictures: Mapping[int, Picture]) -> list[Element | N
 
 def _verdict(facts: Facts, errors: Sequence[Chart]) -> Element:
     """The verdict, what did the most harm, and the error with the findings' frames."""
+    known = any(math.isfinite(f.harm_m) for f in facts.findings) or not facts.findings
     first = [_card(k, f) for k, f in enumerate(facts.findings[:FIRST])]
     found: Content = el("ol", first, class_="cards") if first else el("p", "The diagnosis found nothing.")
     return _section(
@@ -118,7 +118,7 @@ def _verdict(facts: Facts, errors: Sequence[Chart]) -> Element:
         el("p", el("strong", WORDS[facts.gravity], class_=f"badge {WORDS[facts.gravity]}"), " ", facts.upshot,
            class_="upshot"),
         _list(facts.advice[1:]),
-        el("h3", "What did the most harm"),
+        el("h3", "What did the most harm" if known else "The gravest findings"),
         found,
         el("p", "Plots: hover, or focus one and use the arrow keys (with Shift ten points, Home and End). Frames of "
            "findings are shaded.", class_="help"),
@@ -155,7 +155,7 @@ def _findings(facts: Facts, pictures: Mapping[int, Picture]) -> Element:
     if not facts.findings:
         return _section("findings", "Findings", el("p", "The diagnosis found nothing in this run."))
     table = _table(
-        "Findings, those that did the most harm first",
+        "Findings, those that did the most harm first, then the gravest",
         ("#", "finding", "severity", "frames", "worst frame", "harm"),
         [
             (str(k + 1), el("a", f.rule, href=f"#finding-{k + 1}") if k < DETAILED else f.rule, WORDS[f.severity],
@@ -298,8 +298,9 @@ def _settings(facts: Facts) -> Element:
 
 
 def _recording(facts: Facts) -> Element:
-    damage: Content = _list(facts.damage) or el("p", "No damage was found in what was read.")
-    oddities: Content = _list(facts.oddities) or el("p", "Nothing odd was found about clocks and streams.")
+    unknown = "" if facts.run.summary else "Not known: the replay did not come to its end."
+    damage: Content = _list(facts.damage) or el("p", unknown or "No damage was found in what was read.")
+    oddities: Content = _list(facts.oddities) or el("p", unknown or "Nothing odd was found about clocks and streams.")
     return _section("recording", "Damage and clocks", el("h3", "Damage"), damage, el("h3", "Clocks and streams"),
                     oddities)  # fmt: skip
 

@@ -50,13 +50,13 @@ class Axis:
         return [k * step for k in range(first, last + 1)]
 
 
-def value_axis(values: Iterable[Floats], *, from_zero: bool, length: int = HIGH) -> Axis:
-    """The axis that holds all finite values, with a little room."""
+def value_axis(values: Iterable[Floats], *, from_zero: bool, ceiling: float = math.inf) -> Axis:
+    """The axis that holds all finite values up to a ceiling, with a little room."""
     finite = np.concatenate([v[np.isfinite(v)] for v in values] or [np.zeros(0)])
     low, high = (float(finite.min()), float(finite.max())) if len(finite) else (0.0, 1.0)
-    low = min(low, 0.0) if from_zero else low
+    low, high = min(low, 0.0) if from_zero else low, min(high, ceiling)
     room = 0.05 * (high - low) or max(abs(high), 1e-9) * 0.1
-    return Axis(low if from_zero and low == 0 else low - room, high + room, length, flip=True)
+    return Axis(low if from_zero and low == 0 else low - room, high + room, HIGH, flip=True)
 
 
 def number(value: float) -> str:
@@ -71,7 +71,7 @@ def chart_plot(chart: Chart, findings: Sequence[Finding]) -> Element:
     """A plot over the frames with the findings' frames shaded."""
     thin = chart.readable().thinned()
     x = frame_axis(thin.frame)
-    y = value_axis((curve.values for curve in thin.curves), from_zero=chart.from_zero)
+    y = value_axis((curve.values for curve in thin.curves), from_zero=chart.from_zero, ceiling=chart.ceiling)
     at = x(thin.frame.astype(np.float64))
     lines = [
         el("path", d=path(at, y(curve.values)), class_=f"curve {curve.role} c{k % 8}")

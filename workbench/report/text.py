@@ -20,7 +20,7 @@ def markdown(facts: Facts, pictures: Mapping[int, Sequence[str]]) -> str:
 
 
 def _blocks(facts: Facts, pictures: Mapping[int, Sequence[str]]) -> Iterable[str]:
-    yield f"## {plain(facts.recording)}: run {plain(facts.name)}"
+    yield f"## {plain(facts.title)}"
     yield f"**{WORDS[facts.gravity]}**: {plain(facts.upshot)}"
     yield _bullets(facts.advice[1:])
     yield _titled("Not in this report", _bullets(facts.missing))
