@@ -8,13 +8,16 @@ import re
 import shutil
 import time
 from pathlib import Path
+from types import SimpleNamespace
+from typing import cast
 
 import numpy as np
 import pytest
 import tomli_w
 from browser import Browser, chromium
 
-from pipelines.verdict import Severity
+from pipelines.ranging.filter import Status
+from pipelines.verdict import Severity, Verdict
 from workbench import cli, report
 from workbench.diagnosis.finding import Evidence, Finding
 from workbench.report import curves, markup, plots
@@ -172,6 +175,17 @@ def test_thinning_keeps_every_extreme() -> None:
     assert curves.extremes(values[:50], 2000).tolist() == list(range(50))
 
 
+def test_strip_keeps_the_gravest_verdict_of_each_stretch() -> None:
+    verdicts = [Verdict.OK] * 20_000
+    verdicts[7777], verdicts[7778] = Verdict.LOST, Verdict.BLURRED
+    run = cast("Run", SimpleNamespace(verdicts=verdicts, frames=np.arange(20_000), t_ns=np.arange(20_000) * 10**7))
+    strip = curves.strip(run)
+    assert len(strip.verdicts) == 500
+    assert strip.verdicts.count(Verdict.LOST) == 1
+    assert strip.frame[strip.verdicts.index(Verdict.LOST)] == 7777
+    assert strip.t_s[strip.verdicts.index(Verdict.LOST)] == 77.77
+
+
 def test_axes_have_round_numbers_inside() -> None:
     for low, high in ((0.0, 1.0), (-3.2e-5, 7.1e-5), (1234.0, 98765.0)):
         axis = plots.Axis(low, high, 1000, flip=True)
@@ -181,6 +195,24 @@ def test_axes_have_round_numbers_inside() -> None:
         assert axis(low) == 1000
         assert axis(high) == 0
     assert plots.path(np.array([0.0, 1, 2, 3]), np.array([5.0, np.nan, 7, 8])) == "M0 5h0M2 7L3 8"
+
+
+def test_shades_lie_at_the_frames_of_the_finding() -> None:
+    axis = plots.frame_axis(np.arange(101))
+    (shade,) = plots.shades([finding(spans=((10, 14), (15, 16), (50, 50)))], axis)
+    assert re.findall(r"M(\d+) 0H(\d+)V", shade.get("d", "")) == [("190", "330"), ("990", "1010")]
+
+
+def test_small_errors_are_plotted_in_small_units_and_wild_values_leave_the_plot() -> None:
+    frame = np.arange(3)
+    tiny = curves.Chart("a", "a", "m", "a", frame, frame / 10, (curves.Curve("a", np.array([0.0, np.nan, 3e-5])),))
+    assert tiny.readable().unit == "µm"
+    np.testing.assert_allclose(tiny.readable().curves[0].values, [0, np.nan, 30])
+    wild = dataclasses.replace(tiny, curves=(curves.Curve("a", np.array([1.0, 2, 500])),), ceiling=6.0)
+    assert wild.readable() is wild
+    text = markup.drawing(plots.chart_plot(wild, []))
+    assert "500" in text  # still to be read under the cursor
+    assert "&quot;y&quot;:[0.75,6.25]" in text
 
 
 # ------------------------------------------------------------------------------------ pictures
@@ -218,6 +250,18 @@ def test_picture_of_ranges_shows_the_measured_points(ranges: Run) -> None:
     assert len(picture.rows) == len(measured)
 
 
+def test_ranges_without_images_are_drawn_on_a_canvas(ranges: Run, tmp_path: Path) -> None:
+    blind = other_run(ranges, tmp_path / "blind")
+    blind.sensors_file.unlink()
+    frame = int(blind.frames[-1])
+    picture = pictures(blind, [frame])[frame]
+    assert picture.image is not None
+    assert picture.image.get("viewBox") == "0 0 640 480"
+    assert not list(picture.image.iter("image"))
+    assert len(list(picture.image.iter("circle"))) == len(picture.rows)
+    assert "no image of this frame" in picture.caption
+
+
 # ------------------------------------------------------------------------------------ the page
 
 
@@ -241,6 +285,7 @@ def test_page_has_every_section_and_asks_for_nothing(facts: report.Facts) -> Non
         assert (attributes.get("src")) is None
     assert "12.5 mm of the end-point error" in page.text
     assert "max_peak_ratio" in page.text
+    assert "The end is 87 mm off: 58 mm by wrong shifts, 29 mm by wrong turns" in page.text
 
 
 def test_drift_section_is_left_out_without_a_budget(replayed: Run) -> None:
@@ -249,14 +294,26 @@ def test_drift_section_is_left_out_without_a_budget(replayed: Run) -> None:
 
 def test_page_of_ranges_has_each_landmark_and_nis(ranges: Run) -> None:
     facts = report.facts_of(ranges, findings=[finding(int(ranges.frames[-1]), spans=((5, 9),))])
-    keys = [chart.key for chart in facts.charts]
+    keys = [chart.key for chart in facts.charts if chart.key != "range-error"]
     assert keys == ["range-1", "range-2", "range-3", "range-4", "nis", "relative-sigma"]
-    chart = facts.charts[0]
+    chart = next(chart for chart in facts.charts if chart.key == "range-1")
     depth = ranges.column("range_m")[:, 0]
     np.testing.assert_allclose(chart.curves[0].values, depth, equal_nan=True)
     reference = next(c for c in chart.curves if c.role == "reference").values
     assert np.nanmax(np.abs(depth[-3:] / reference[-3:] - 1)) < 0.5
     assert "Path" not in re.findall(r"<h2[^>]*>([^<]+)</h2>", report.page_of(facts))
+
+
+def test_range_error_is_that_of_the_ranges_that_count(ranges: Run) -> None:
+    settled = dataclasses.replace(ranges, _columns=ranges.columns([*ranges.fields, "frame", "t_ns"]))
+    settled._columns["status"] = np.full_like(ranges.column("status"), Status.CONVERGED)
+    settled._columns["status"][:, 0] = Status.CONVERGING
+    charts = {chart.key: chart for chart in curves.own(settled)}
+    assert "range-error" not in [chart.key for chart in curves.own(ranges)]  # nothing counts so early
+    worst = charts["range-error"].curves[1].values
+    slots = [{c.name: c.values for c in charts[f"range-{k}"].curves} for k in (2, 3, 4)]
+    errors = [100 * abs(c["range Z"][-1] / c["reference"][-1] - 1) for c in slots]
+    assert worst[-1] == pytest.approx(max(errors))
 
 
 def test_hostile_names_stay_text(replayed: Run, tmp_path: Path) -> None:

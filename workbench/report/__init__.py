@@ -9,22 +9,22 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from readers.streams import WorkbenchError
 from workbench.report.facts import Drift, Facts, facts_of, values
 from workbench.report.markup import drawing
 from workbench.report.page import PICTURED, html
 from workbench.report.pictures import Picture, pictures
 from workbench.report.text import markdown
 
-__all__ = ["Drift", "Facts", "facts_of", "page_of", "text_of", "values", "write"]
+__all__ = ["Drift", "Facts", "facts_of", "page_of", "pictures_of", "text_of", "values", "write"]
 
 
 def pictures_of(facts: Facts) -> dict[int, Picture]:
-    """The pictures of the worst frames of the first findings; none where the files cannot be read."""
-    try:
-        return pictures(facts.run, [finding.worst_frame for finding in facts.findings[:PICTURED]])
-    except WorkbenchError:
-        return {}
+    """The pictures of the worst frames of the first findings.
+
+    Raises:
+        RecordingError: the run's own file cannot be read.
+    """
+    return pictures(facts.run, [finding.worst_frame for finding in facts.findings[:PICTURED]])
 
 
 def page_of(facts: Facts) -> str:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,8 +12,10 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.stats import chi2
 
+from pipelines.ranging.filter import Status
 from pipelines.verdict import Verdict
 from workbench.runs import Run
+from workbench.schema import Archetype
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -229,7 +232,9 @@ def _range(run: Run) -> list[Chart]:
     used = [k for k in range(sigma.shape[1]) if np.isfinite(sigma[:, k]).any()]
     shown, rest = used[:MOST_SLOTS], len(used) - len(used[:MOST_SLOTS])
     more = f" {rest} more slots are in the recording's columns." if rest else ""
-    charts = [chart for k in shown for chart in _slot(run, k)]
+    logged = {k: _logged(run, k) for k in shown}
+    charts = _range_error(run, logged)
+    charts += [_slot(run, k, values) for k, values in logged.items()]
     charts.append(_nis(run, nis))
     about = "σ_ξ/ξ of the landmark in each slot: what the filter believes to know of its range." + more
     lines = tuple(Curve(f"slot {k + 1}", np.where(np.isfinite(sigma[:, k]), sigma[:, k], np.nan)) for k in shown)
@@ -238,27 +243,54 @@ def _range(run: Run) -> list[Chart]:
     return charts
 
 
-def _slot(run: Run, slot: int) -> list[Chart]:
-    """Range of the landmark in a slot against the reference, as the replay logged it."""
+def _logged(run: Run, slot: int) -> Floats:
+    """Range, nearest, farthest and reference range [n, 4] of the landmark in a slot, as the replay logged them."""
     from workbench.rrd_reading import series
 
-    found = series(run.file, f"{run.root}/landmark/{slot + 1}/range", "Scalars:scalars")
-    if not len(found.frame):
+    found = series(run.file, f"{run.root}/landmark/{slot + 1}/range", Archetype.SCALARS.value)
+    values = np.full((len(run.frames), 4), np.nan)
+    if len(found.frame):
+        rows = np.searchsorted(run.frames, found.frame).clip(0, len(run.frames) - 1)
+        good = run.frames[rows] == found.frame
+        values[rows[good]] = found.values[good]
+    return values
+
+
+def _range_error(run: Run, logged: Mapping[int, Floats]) -> list[Chart]:
+    """Error of the ranges that count; none without a reference."""
+    if not logged:
         return []
-    values = np.full((len(run.frames), found.values.shape[1]), np.nan)
-    rows = np.searchsorted(run.frames, found.frame).clip(0, len(run.frames) - 1)
-    good = run.frames[rows] == found.frame
-    values[rows[good]] = found.values[good]
-    depth, near, far, reference = values.T[:4]
+    depth, _, _, reference = np.stack(list(logged.values()), axis=1).transpose(2, 0, 1)
+    counts = run.column("status")[:, list(logged)] == Status.CONVERGED
+    error = np.where(counts, 100 * np.abs(depth / reference - 1), np.nan)
+    if not np.isfinite(error).any():
+        return []
+    curves = (Curve("median of the landmarks", _over(np.nanmedian, error)),
+              Curve("worst landmark", _over(np.nanmax, error)))  # fmt: skip
+    about = "Of the ranges that count, against the reference."
+    return [Chart("range-error", "Range error", "%", about, run.frames, seconds(run), curves, from_zero=True)]
+
+
+def _slot(run: Run, slot: int, logged: Floats) -> Chart:
+    """Range of the landmark in a slot against the reference."""
+    depth, near, far, reference = logged.T
     known = reference if np.isfinite(reference).any() else depth
     ceiling = CUT * float(np.nanpercentile(known, 90)) if np.isfinite(known).any() else math.inf
     curves = [Curve("range Z", depth), Curve("nearest (2σ)", near, "bound"), Curve("farthest (2σ)", far, "bound")]
     if np.isfinite(reference).any():
         curves.append(Curve("reference", reference, "reference"))
     about = "Depth along the optical axis, with what ± 2 σ_ξ leaves open; the wild ranges of a start leave the plot."
-    title = f"Range of the landmark in slot {slot + 1}"
-    key = f"range-{slot + 1}"
-    return [Chart(key, title, "m", about, run.frames, seconds(run), tuple(curves), from_zero=True, ceiling=ceiling)]
+    return Chart(
+        f"range-{slot + 1}",
+        f"Range of the landmark in slot {slot + 1}",
+        "m",
+        about,
+        run.frames,
+        seconds(run),
+        tuple(curves),
+        from_zero=True,
+        ceiling=ceiling,
+    )
 
 
 def _nis(run: Run, nis: Floats) -> Chart:

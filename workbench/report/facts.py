@@ -430,8 +430,8 @@ def spans_text(finding: Finding, most: int = 8) -> str:
 
 
 def harm_text(finding: Finding) -> str:
-    """What a finding did, in metres."""
-    return "harm not known" if math.isnan(finding.harm_m) else f"{length(finding.harm_m)} of the end-point error"
+    """What a finding did, in metres; nothing where that is not known."""
+    return "" if math.isnan(finding.harm_m) else f"{length(finding.harm_m)} of the end-point error"
 
 
 def commands(facts: Facts, finding: Finding) -> list[str]:

@@ -85,7 +85,7 @@ def _section(key: str, title: str, *content: Content) -> Element:
 
 
 def _sections(facts: Facts, pictures: Mapping[int, Picture]) -> list[Element | None]:
-    errors = [chart for chart in facts.charts if chart.key in ("position-error", "heading-error")]
+    errors = [chart for chart in facts.charts if chart.key in ("position-error", "heading-error", "range-error")]
     others = [chart for chart in facts.charts if chart not in errors]
     return [
         _verdict(facts, errors[:1]),
@@ -129,10 +129,11 @@ def _verdict(facts: Facts, errors: Sequence[Chart]) -> Element:
 
 def _card(place: int, finding: Finding) -> Element:
     word = WORDS[finding.severity]
+    harm: Content = (": ", el("strong", harm_text(finding))) if harm_text(finding) else None
     return el(
         "li",
         el("p", el("strong", word, class_=f"badge {word}"), " ",
-           el("a", finding.rule, href=f"#finding-{place + 1}"), ": ", el("strong", harm_text(finding))),
+           el("a", finding.rule, href=f"#finding-{place + 1}"), harm),
         el("p", finding.sentence),
         el("p", f"Frames {spans_text(finding, 3)}; worst: {finding.worst_frame}.", class_="where"),
     )  # fmt: skip
@@ -186,6 +187,7 @@ def _finding(facts: Facts, place: int, finding: Finding, picture: Picture | None
                     ("Likely cause", finding.cause),
                     ("What to try", finding.remedy),
                 )
+                if text
             ],
         ),
         _evidence(finding.evidence),

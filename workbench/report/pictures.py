@@ -376,6 +376,8 @@ def _marks(here: Mapping[str, list[Any]], measured: Floats, predicted: Floats, *
 def _landmarks(run: Run, row: int) -> tuple[tuple[tuple[str, ...], tuple[tuple[str, ...], ...]],
                                             tuple[int, Floats] | None]:  # fmt: skip
     """The numbers of a frame's landmarks; number and image point of the one with the largest NIS, where one is."""
+    if "landmark_id" not in run.fields:
+        return ((), ()), None
     here = {name: column[row] for name, column in run.columns(_LANDMARK_FIELDS).items()}
     carried = np.flatnonzero(np.isfinite(here["landmark_id"]))[:MOST_LANDMARKS]
     here = {name: values[carried] for name, values in here.items()}

@@ -45,10 +45,11 @@ def _findings(facts: Facts, pictures: Mapping[int, Sequence[str]]) -> Iterable[s
     if not facts.findings:
         yield "The diagnosis found nothing."
     for k, f in enumerate(facts.findings[:FINDINGS]):
+        grave = ", ".join(filter(None, (WORDS[f.severity], harm_text(f))))
+        cause, remedy = (plain(text).rstrip(".") for text in (f.cause, f.remedy))
         lines = [
-            f"{k + 1}. **{plain(f.rule)}** ({WORDS[f.severity]}, {harm_text(f)}): {plain(f.sentence)}",
-            f"   Frames {spans_text(f, 4)}; worst {f.worst_frame}. Likely cause: {plain(f.cause)}. "
-            f"Try: {plain(f.remedy)}.".replace("..", "."),
+            f"{k + 1}. **{plain(f.rule)}** ({grave}): {plain(f.sentence)}",
+            f"   Frames {spans_text(f, 4)}; worst {f.worst_frame}. Likely cause: {cause}. Try: {remedy}.",
             *(f"   {_code(line)}  " for line in commands(facts, f)),
             *(f"   ![frame {f.worst_frame}]({link})" for link in pictures.get(f.worst_frame, ())),
         ]
