@@ -195,7 +195,17 @@ def stored_image(path: Path, entity: str, frame: int) -> Mapping[str, Any] | Non
     Raises:
         RecordingError: the file cannot be read.
     """
-    return next((row for _, row in stored_images(path, entity, [frame])), None)
+    for chunk in chunks(path, entity):
+        batch = chunk.to_record_batch()
+        if "frame" not in batch.schema.names:
+            continue
+        at = np.flatnonzero(batch.column("frame").to_numpy() == frame)
+        if len(at):
+            row = batch.slice(int(at[0]), 1)
+            found = {name: row.column(name)[0].as_py() for name in row.schema.names if ":" in name}
+            if any(found.values()):
+                return found
+    return None
 
 
 def stored_images(path: Path, entity: str, frames: Sequence[int]) -> Iterator[tuple[int, Mapping[str, Any]]]:
