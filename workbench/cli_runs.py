@@ -1,4 +1,4 @@
-"""The commands about finished runs: explain, compare, check, sweep, export.
+"""The commands about finished runs: explain, compare, report, check, sweep, export.
 
 `workbench.cli` takes them up; what is said there of output and exit statuses holds here, and one more: 4, an
 expectation of ``check`` is not met.
@@ -55,6 +55,7 @@ def add_to(app: typer.Typer) -> None:
     for command, short, lines in (
         (explain, "Why a frame is as it is: a screenful about it.", EXPLAIN),
         (compare, "Runs side by side, and where they part.", COMPARE),
+        (report, "Make a page that tells what a run concluded, what failed, and why.", REPORT),
         (check, "Hold runs against expectations, for CI.", CHECK),
         (sweep, "Replay over a grid of settings and recordings.", SWEEP),
         (export, "A run as Parquet, CSV, TUM, KITTI or one .rrd.", EXPORT),
@@ -368,6 +369,58 @@ def _comparison_values(found: Comparison) -> dict[str, Any]:
             for p in found.partings
         ],
     }
+
+
+# --------------------------------------------------------------------------------- report
+
+
+REPORT = (
+    "workbench report results/mission -o report.html",
+    "workbench report results/mission/best.rrd --md > report.md",
+    "workbench report results/mission --md -o report.md --pictures pictures/",
+    "workbench report results/mission --json | jq .findings[0]",
+)
+
+
+def report(
+    run: RunPath,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", metavar="FILE", help="File to write [RUN.html beside the run].")
+    ] = None,
+    as_markdown: Annotated[bool, typer.Option("--md", help="Short Markdown instead, on stdout without -o.")] = False,
+    picture_folder: Annotated[
+        Path | None, typer.Option("--pictures", metavar="DIR", help="Of --md: the findings' pictures as SVG files.")
+    ] = None,
+    as_json: AsJson = False,
+) -> None:
+    """Make one page of a run: verdict, ranked findings with pictures, errors, metrics, settings, versions.
+
+    The page holds everything that it shows, opens without a network, and prints. --md is for a pull request.
+    """
+    from workbench import report as reports
+    from workbench.runs import open_run
+    from workbench.settings import SettingsError
+
+    if as_json and (as_markdown or out is not None):
+        raise SettingsError("--json prints on stdout; leave --md and -o out")
+    if picture_folder is not None and not as_markdown:
+        raise SettingsError("--pictures goes with --md; the HTML page holds its pictures")
+    opened = open_run(run)
+    facts = reports.facts_of(opened, str(run))
+    if as_json:
+        print_json(reports.values(facts))
+    elif as_markdown:
+        text = reports.text_of(facts, picture_folder, None if out is None else out.parent)
+        if out is None:
+            print(text, end="")
+        else:
+            _tell_written(reports.write(text, out))
+    else:
+        _tell_written(reports.write(reports.page_of(facts), out or opened.path("html")))
+
+
+def _tell_written(file: Path) -> None:
+    print(f"written      {shown(str(file))} ({file.stat().st_size / 1e6:.2f} MB)")
 
 
 # ---------------------------------------------------------------------------------- check

@@ -234,6 +234,24 @@ def stored_image(path: Path, entity: str, frame: int) -> Mapping[str, Any] | Non
     return None
 
 
+def stored_images(path: Path, entity: str, frames: Sequence[int]) -> Iterator[tuple[int, Mapping[str, Any]]]:
+    """The images of some frames as they were logged, number and components, in one pass over the file.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    for chunk in chunks(path, entity):
+        batch = chunk.to_record_batch()
+        if "frame" not in batch.schema.names:
+            continue
+        numbers = batch.column("frame").to_numpy()
+        for at in np.flatnonzero(np.isin(numbers, frames)).tolist():
+            row = batch.slice(at, 1)
+            found = {name: row.column(name)[0].as_py() for name in row.schema.names if ":" in name}
+            if any(found.values()):
+                yield int(numbers[at]), found
+
+
 # ------------------------------------------------------------------------- whole files
 
 

@@ -302,8 +302,23 @@ class Run:
         from workbench.rrd_reading import stored_image
 
         row = stored_image(self.sensors_file, IMAGE, frame) if self.sensors_file.is_file() else None
-        if row is None:
-            return None
+        return None if row is None else self._image(frame, row)
+
+    def images(self, frames: Iterable[int]) -> dict[int, ImageSample]:
+        """The images of some frames, those that there are, in one pass over the file.
+
+        Raises:
+            RecordingError: as `image`.
+        """
+        from workbench.rrd_reading import stored_images
+
+        if not self.sensors_file.is_file():
+            return {}
+        rows = stored_images(self.sensors_file, IMAGE, list(frames))
+        found = ((frame, self._image(frame, row)) for frame, row in rows)
+        return {frame: sample for frame, sample in found if sample is not None}
+
+    def _image(self, frame: int, row: Mapping[str, Any]) -> ImageSample | None:
         t_ns = int(self.t_ns[self.row_of(frame)])
         return _sample(row, frame, t_ns, self.about["image_stream"], str(self.sensors_file))
 
