@@ -6,23 +6,10 @@ strong it is, within the range of the table below, in which the fault matters.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
-
-from pipelines.correlation.odometry import CorrelationOdometry
-from pipelines.correlation.settings import CorrelationSettings
-from pipelines.evaluation import Trajectory
-from pipelines.replay import replay
-from pipelines.simulation import faults as flaws
-from pipelines.simulation.faults import Fault, RepetitiveTexture
-from pipelines.simulation.mission import IMAGE, PAPER_FOCAL_PX, PAPER_HEIGHT_M, POSE, SimulatedMission
-from pipelines.simulation.scenario import Scenario, build
-from readers.streams import PoseSample
-from workbench.diagnosis.finding import Bools, Case
-from workbench.diagnosis.scoring import Planted, Trial
 
 Rng = np.random.Generator
 FRAMES, RATE_HZ, SIDE_PX, SPEED_KMH = 120, 60.0, 288, 2.0

@@ -129,12 +129,6 @@ class Signals:
         known = pd.DataFrame(rate).ffill().shift(1).to_numpy()
         return np.asarray(motion - known * self.dt_s[:, None])
 
-    # ---- what is usual
-
-    def usual(self, values: Floats) -> Floats:
-        """Median over the frames around, whatever is not finite left out."""
-        return usual(values)
-
 
 def usual(values: Floats) -> Floats:
     """Running median [n] over `USUAL_FRAMES` centred frames, whatever is not finite left out."""
@@ -147,3 +141,9 @@ def extended(strong: Bools, weak: Bools) -> Bools:
     weak = weak | strong
     run = np.cumsum(np.diff(weak.astype(np.int8), prepend=0) == 1)
     return weak & np.isin(run, run[strong])
+
+
+def spread_of(values: Floats) -> tuple[float, float]:
+    """Median, and median absolute deviation as the standard deviation that it stands for."""
+    middle = float(np.median(values))
+    return middle, 1.4826 * float(np.median(np.abs(values - middle)))
