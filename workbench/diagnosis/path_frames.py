@@ -36,7 +36,7 @@ def _ones(signals: Signals, before: Bools) -> Floats:
 
 def _tell_count(what: str) -> Callable[[Shown], Told]:
     def tell(shown: Shown) -> Told:
-        signals, worst = shown.signals, shown.worst
+        signals = shown.signals
         count = int((shown.shows & ~signals.compared).sum())
         since_s = float(np.nanmax(np.where(shown.shows, signals.dt_s, np.nan), initial=0.0))
         sentence = f"{frames(count)} {what}; the motion of up to {since_s:.3f} s has to be found in one step."

@@ -7,9 +7,9 @@ import math
 import numpy as np
 
 from pipelines.verdict import Severity, Verdict
-from workbench.diagnosis.finding import Bools, Evidence
+from workbench.diagnosis.finding import Bools, Evidence, Floats
 from workbench.diagnosis.path_mode import Bounds, Mode, Shown, Told, evidence
-from workbench.diagnosis.path_signals import Signals, extended, usual
+from workbench.diagnosis.path_signals import USUAL_FRAMES, Signals, extended, lasting, previous, usual
 
 # --------------------------------------------------------------------------------- the image
 
@@ -45,15 +45,25 @@ EXPOSURE = Mode(
     shows=_exposed,
     strength=lambda signals, _: np.abs(signals.brightening),
     tell=_tell_exposure,
-    spreads=False,
 )
 
 
 def _blurred(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
-    sharpness = signals.sharpness / usual(signals.sharpness)
+    """Sharpness and gain of the match fall at once, until the sharpness is back; or the peak is long as well as low."""
+    sharpness, ratio = signals.sharpness, signals.sharpness / usual(signals.sharpness)
+    faded = signals.gain < bounds["gain_ratio"] * usual(signals.gain)
+    fell = sharpness < bounds["step_ratio"] * np.concatenate([sharpness[:1], sharpness[:-1]])
+    sound = signals.residual < bounds["residual_factor"] * usual(signals.residual)
+    onset = np.flatnonzero(fell & faded & previous(sound) & ~before)
+    found = np.zeros(len(sharpness), dtype=bool)
+    for k in onset:
+        level = float(np.median(sharpness[max(k - 5, 0) : k]))
+        sharp = np.flatnonzero(sharpness[k:] > bounds["back_ratio"] * level)
+        stop = k + int(sharp[0]) if len(sharp) else len(sharpness)
+        found[k : min(stop, k + USUAL_FRAMES // 2)] = True
     longish = signals.anisotropy > bounds["anisotropy_factor"] * usual(signals.anisotropy)
-    dull = (sharpness < bounds["sharpness_ratio"]) & (signals.correlation > bounds["min_correlation"])
-    return extended(dull & longish, (sharpness < bounds["weak_sharpness_ratio"]) & longish)
+    clear = signals.correlation > bounds["min_correlation"]
+    return found | (longish & clear & (ratio < bounds["sharpness_ratio"]))
 
 
 def _tell_blur(shown: Shown) -> Told:
@@ -79,7 +89,15 @@ BLUR = Mode(
     severity=Severity.WARNING,
     cause="the shutter is open for a good part of the frame interval: too little light, or too fast",
     remedy="shorten the exposure or add light; a larger fragment_side_px stands more blur",
-    thresholds={"sharpness_ratio": 0.65, "weak_sharpness_ratio": 0.8, "anisotropy_factor": 1.8, "min_correlation": 0.6},
+    thresholds={
+        "step_ratio": 0.85,
+        "gain_ratio": 0.85,
+        "back_ratio": 0.85,
+        "sharpness_ratio": 0.5,
+        "anisotropy_factor": 2.0,
+        "min_correlation": 0.6,
+        "residual_factor": 1.5,
+    },
     shows=_blurred,
     strength=lambda signals, _: -signals.sharpness,
     tell=_tell_blur,
@@ -87,11 +105,23 @@ BLUR = Mode(
 )
 
 
+def _roughness(signals: Signals) -> Floats:
+    """Squared gradient beyond the usual [n], grey²/px², at the usual brightness."""
+    more = signals.sharpness - usual(signals.sharpness)
+    return np.asarray(more * np.maximum(usual(signals.mean_grey), 1.0) ** 2)
+
+
+def _held(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
+    """The image content stands still though the vehicle usually moves."""
+    speed = np.hypot(*signals.shift.T)
+    usual_speed = usual(np.where(before, np.nan, speed))
+    return np.asarray((speed < bounds["still_share"] * usual_speed) & (usual_speed > bounds["min_speed_px"]))
+
+
 def _noisy(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     """White noise of σ leaves residuals of σ to √2 σ and adds four times σ² to the squared gradient."""
     residual = signals.residual
-    added = signals.gradient_energy - usual(signals.gradient_energy)
-    rough = added > bounds["gradient_share"] * residual**2
+    rough = (_roughness(signals) > bounds["gradient_share"] * residual**2) & ~_held(signals, bounds, before)
     high = residual > bounds["residual_factor"] * usual(residual)
     return extended(high & rough, rough & (residual > bounds["weak_residual_factor"] * usual(residual)))
 
@@ -122,7 +152,13 @@ NOISE = Mode(
     severity=Severity.WARNING,
     cause="the sensor's gain is high (too little light), or the link or the codec disturbs the images",
     remedy="add light, lower the camera's gain; a larger fragment_side_px averages over more pixels",
-    thresholds={"residual_factor": 1.8, "weak_residual_factor": 1.3, "gradient_share": 0.8},
+    thresholds={
+        "residual_factor": 1.8,
+        "weak_residual_factor": 1.3,
+        "gradient_share": 1.0,
+        "still_share": 0.3,
+        "min_speed_px": 1.0,
+    },
     shows=_noisy,
     strength=lambda signals, _: signals.residual,
     tell=_tell_noise,
@@ -131,22 +167,23 @@ NOISE = Mode(
 
 
 def _dirty(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
-    """The image content stands still and is badly matched while the vehicle moves: the pattern is on the lens."""
-    speed = np.hypot(*signals.shift.T)
-    moving = usual(np.where(before, np.nan, speed)) > bounds["min_speed_px"]
-    still = speed < bounds["still_share"] * usual(np.where(before, np.nan, speed))
-    bad = signals.residual > bounds["residual_factor"] * usual(np.where(before, np.nan, signals.residual))
-    weak = bad | signals.case.rings(Verdict.REACQUIRED | Verdict.LOST)
-    return extended(still & bad & moving & ~before, weak & ~before)
+    """A pattern on the lens: it holds the match though the vehicle moves, or spoils it with new templates as well."""
+    residual = signals.residual / usual(np.where(before, np.nan, signals.residual))
+    poor = (residual > bounds["residual_factor"]) & (signals.template_row >= 0)
+    smooth = _roughness(signals) < bounds["gradient_share"] * signals.residual**2
+    matched = signals.correlation > bounds["min_correlation"]
+    always = (residual > bounds["always_factor"]) & poor[signals.template_row] & smooth & matched
+    weak = (poor & smooth) | signals.case.rings(Verdict.REACQUIRED | Verdict.LOST)
+    return extended(((_held(signals, bounds, before) & poor) | always) & ~before, weak & ~before)
 
 
 def _tell_dirt(shown: Shown) -> Told:
     signals, worst = shown.signals, shown.worst
     residual, speed = signals.residual, np.hypot(*signals.shift.T)
     return (
-        f"In {shown.frames} a pattern that does not move with the ground holds the match: shift "
-        f"{speed[worst]:.2f} px against the usual {usual(speed)[worst]:.1f} px, with {residual[worst]:.1f} grey levels "
-        "left over.",
+        f"In {shown.frames} {signals.residual[worst]:.1f} grey levels remain after the match (usual: "
+        f"{usual(signals.residual)[worst]:.1f}), new templates or not, and the shift is {speed[worst]:.2f} px where "
+        f"{usual(speed)[worst]:.1f} px are usual: a pattern does not move with the ground.",
         (
             evidence(
                 signals,
@@ -167,9 +204,16 @@ DIRT = Mode(
     severity=Severity.ERROR,
     cause="dirt, drops or a reflection on the lens or its window: a pattern that stays in its place in the image",
     remedy="clean the lens; keep fragments away from the spot with columns, rows, span_u_px and span_v_px",
-    thresholds={"still_share": 0.3, "residual_factor": 1.6, "min_speed_px": 1.0},
+    thresholds={
+        "still_share": 0.3,
+        "min_speed_px": 1.0,
+        "residual_factor": 1.6,
+        "always_factor": 2.5,
+        "gradient_share": 0.8,
+        "min_correlation": 0.4,
+    },
     shows=_dirty,
-    strength=lambda signals, _: np.where(np.hypot(*signals.shift.T) < 1.0, signals.residual, 0.0),
+    strength=lambda signals, _: np.where(signals.accepted, signals.residual, 0.0),
     tell=_tell_dirt,
     spoils=True,
 )
@@ -179,7 +223,9 @@ DIRT = Mode(
 
 
 def _striped(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
-    return extended(signals.condition > bounds["condition"], signals.condition > bounds["weak_condition"])
+    condition = signals.case["condition"]  # infinite where there is no texture at all, which is another thing
+    share = np.mean(np.isfinite(condition) & (condition > bounds["condition"]), axis=1)
+    return extended(share > bounds["share"], share > bounds["weak_share"])
 
 
 def _tell_stripes(shown: Shown) -> Told:
@@ -200,7 +246,7 @@ APERTURE = Mode(
     cause="stripes, planks, kerbs or a grating: along them one place looks like the next",
     remedy="use fragments that reach beyond the stripes: more columns and rows, wider span_u_px and span_v_px, a "
     "larger fragment_side_px; or a camera that sees more of the ground",
-    thresholds={"condition": 9.0, "weak_condition": 6.0},
+    thresholds={"condition": 9.0, "share": 0.5, "weak_share": 0.2},
     shows=_striped,
     strength=lambda signals, _: signals.condition,
     tell=_tell_stripes,
@@ -208,9 +254,17 @@ APERTURE = Mode(
 )
 
 
+def _twins(signals: Signals, bounds: Bounds) -> Floats:
+    """Share of the fragments [n] with a second peak that is nearly as high as the first, and apart from it."""
+    apart = np.hypot(*np.moveaxis(signals.case["second_peak_px"] - signals.case["peak_px"], -1, 0))
+    twin = (signals.case["peak_ratio"] > bounds["peak_ratio"]) & (apart > bounds["min_apart_px"])
+    return np.asarray(np.mean(twin, axis=1))
+
+
 def _repeating(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
-    twin = (signals.peak_ratio > bounds["peak_ratio"]) & (signals.correlation > bounds["min_correlation"])
-    return extended(twin, signals.peak_ratio > bounds["weak_peak_ratio"])
+    twins, clear = _twins(signals, bounds), signals.correlation > bounds["min_correlation"]
+    weak = (twins > bounds["weak_share"]) & clear
+    return lasting(extended((twins > bounds["share"]) & clear, weak), int(bounds["min_frames"]))
 
 
 def _tell_repeating(shown: Shown) -> Told:
@@ -234,7 +288,14 @@ REPETITIVE = Mode(
     cause="tiles, gratings, weaves: a shift by one period matches as well as the true one",
     remedy="keep search_radius_px below half the period and prediction = constant-velocity, so that only one peak is "
     "in reach; or a fragment_side_px larger than the period",
-    thresholds={"peak_ratio": 0.95, "weak_peak_ratio": 0.8, "min_correlation": 0.7},
+    thresholds={
+        "peak_ratio": 0.9,
+        "share": 0.5,
+        "weak_share": 0.3,
+        "min_apart_px": 4.5,
+        "min_frames": 3,
+        "min_correlation": 0.7,
+    },
     shows=_repeating,
     strength=lambda signals, _: signals.peak_ratio,
     tell=_tell_repeating,
@@ -244,10 +305,9 @@ REPETITIVE = Mode(
 
 def _pale(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     """The match is low though no more is left over than ever: there is nothing to match."""
-    residual = signals.residual < bounds["residual_factor"] * usual(signals.residual)
-    weak = signals.eigenvalue < bounds["eigenvalue_share"] * usual(signals.eigenvalue)
+    usually = signals.residual < bounds["residual_factor"] * usual(signals.residual)
     low = signals.correlation < bounds["correlation"]
-    return extended(low & residual & weak, (signals.correlation < bounds["weak_correlation"]) & residual & weak)
+    return extended(low & usually, (signals.correlation < bounds["weak_correlation"]) & usually)
 
 
 def _tell_pale(shown: Shown) -> Told:
@@ -270,7 +330,7 @@ LOW_TEXTURE = Mode(
     severity=Severity.WARNING,
     cause="smooth or evenly coloured ground, or an image out of focus: noise is all there is to match",
     remedy="focus the camera, light the ground from the side; a larger fragment_side_px gathers more texture",
-    thresholds={"correlation": 0.6, "weak_correlation": 0.8, "eigenvalue_share": 0.6, "residual_factor": 1.25},
+    thresholds={"correlation": 0.6, "weak_correlation": 0.75, "residual_factor": 1.25},
     shows=_pale,
     strength=lambda signals, _: -signals.correlation,
     tell=_tell_pale,

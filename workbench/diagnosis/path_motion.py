@@ -9,13 +9,14 @@ import numpy as np
 from pipelines.verdict import Severity
 from workbench.diagnosis.finding import Bools, Floats
 from workbench.diagnosis.path_mode import Bounds, Mode, Shown, Told, evidence
-from workbench.diagnosis.path_signals import Signals, spread_of
+from workbench.diagnosis.path_signals import Signals, lasting, previous, spread_of
 
 # -------------------------------------------------------------------------------- the motion
 
 
 def _turned(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
-    return np.asarray(signals.surprise_rad > bounds["limit_factor"] * signals.case["rotation_limit_rad"])
+    beyond = signals.surprise_rad > bounds["limit_factor"] * signals.case["rotation_limit_rad"]
+    return np.asarray(beyond & ~previous(before))  # what comes before has to be known
 
 
 def _tell_turned(shown: Shown) -> Told:
@@ -45,7 +46,8 @@ TURNED = Mode(
 
 
 def _jumped(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
-    return np.asarray(signals.surprise_px > signals.case["search_radius_px"] + bounds["beyond_px"])
+    beyond = signals.surprise_px > signals.case["search_radius_px"] + bounds["beyond_px"]
+    return np.asarray(beyond & ~previous(before))
 
 
 def _tell_jumped(shown: Shown) -> Told:
@@ -106,8 +108,7 @@ def _standing(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     sigma_px = np.sqrt(covariance[:, 0, 0] + covariance[:, 1, 1])
     still = np.hypot(*signals.shift.T) < np.maximum(bounds["sigmas"] * sigma_px, bounds["min_px"])
     still &= ~before
-    run = np.cumsum(np.diff(still.astype(np.int8), prepend=0) == 1)
-    return np.asarray(still & (np.bincount(run, weights=still)[run] >= bounds["min_frames"]))
+    return lasting(still, int(bounds["min_frames"]))
 
 
 def _tell_standing(shown: Shown) -> Told:

@@ -216,7 +216,7 @@ def _misaligned(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
 
 
 def _tell_misaligned(shown: Shown) -> Told:
-    signals, worst = shown.signals, shown.worst
+    signals = shown.signals
     yaw = float(np.nanmedian(yaw_between(signals, shown.before)))
     given = float(signals.case.settings["mounting_yaw_rad"])
     return (

@@ -143,6 +143,17 @@ def extended(strong: Bools, weak: Bools) -> Bools:
     return weak & np.isin(run, run[strong])
 
 
+def previous(frames: Bools) -> Bools:
+    """The frames [n] that come right after one of those."""
+    return np.concatenate([[False], frames[:-1]])
+
+
+def lasting(frames: Bools, count: int) -> Bools:
+    """Those of the frames [n] that stand in a row of at least `count`."""
+    run = np.cumsum(np.diff(frames.astype(np.int8), prepend=0) == 1)
+    return np.asarray(frames & (np.bincount(run, weights=frames)[run] >= count))
+
+
 def spread_of(values: Floats) -> tuple[float, float]:
     """Median, and median absolute deviation as the standard deviation that it stands for."""
     middle = float(np.median(values))
