@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 
 import numpy as np
+import scipy.ndimage
 
 from pipelines.verdict import Severity, Verdict
 from workbench.diagnosis.finding import Bools, Evidence, Floats
@@ -50,32 +51,31 @@ EXPOSURE = Mode(
 
 def _blurred(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     """Sharpness and gain of the match fall at once, until the sharpness is back; or the peak is long as well as low."""
-    sharpness, ratio = signals.sharpness, signals.sharpness / usual(signals.sharpness)
+    sharpness, ratio = signals.texture, signals.sharpness / usual(signals.sharpness)
     faded = signals.gain < bounds["gain_ratio"] * usual(signals.gain)
     fell = sharpness < bounds["step_ratio"] * np.concatenate([sharpness[:1], sharpness[:-1]])
     sound = signals.residual < bounds["residual_factor"] * usual(signals.residual)
+    smoothed = scipy.ndimage.median_filter(sharpness, 3)
     onset = np.flatnonzero(fell & faded & previous(sound) & ~before)
     found = np.zeros(len(sharpness), dtype=bool)
     for k in onset:
         level = float(np.median(sharpness[max(k - 5, 0) : k]))
-        sharp = np.flatnonzero(sharpness[k:] > bounds["back_ratio"] * level)
-        stop = k + int(sharp[0]) if len(sharp) else len(sharpness)
+        sharp = np.flatnonzero(smoothed[k + 1 :] > bounds["back_ratio"] * level)
+        stop = k + 1 + int(sharp[0]) if len(sharp) else len(sharpness)
         found[k : min(stop, k + USUAL_FRAMES // 2)] = True
     longish = signals.anisotropy > bounds["anisotropy_factor"] * usual(signals.anisotropy)
     clear = signals.correlation > bounds["min_correlation"]
-    return found | (longish & clear & (ratio < bounds["sharpness_ratio"]))
+    return found | lasting(longish & clear & (ratio < bounds["sharpness_ratio"]), int(bounds["min_frames"]))
 
 
 def _tell_blur(shown: Shown) -> Told:
     signals, worst = shown.signals, shown.worst
-    sharp, long = signals.sharpness, signals.anisotropy
+    sharp, long = signals.texture, signals.anisotropy
     return (
         f"In {shown.frames} the sharpness falls to {100 * sharp[worst] / usual(sharp)[worst]:.0f} % of "
         f"the usual and the correlation peak is {long[worst]:.1f} times as long as wide.",
         (
-            evidence(
-                signals, "sharpness", sharp, worst, "1/px²", shown.bounds["sharpness_ratio"] * usual(sharp)[worst]
-            ),
+            evidence(signals, "gradient_energy", signals.gradient_energy, worst, "grey²/px²"),
             evidence(
                 signals, "peak_anisotropy", long, worst, "1", shown.bounds["anisotropy_factor"] * usual(long)[worst]
             ),
@@ -97,9 +97,10 @@ BLUR = Mode(
         "anisotropy_factor": 2.0,
         "min_correlation": 0.6,
         "residual_factor": 1.5,
+        "min_frames": 3,
     },
     shows=_blurred,
-    strength=lambda signals, _: -signals.sharpness,
+    strength=lambda signals, _: -signals.texture,
     tell=_tell_blur,
     spoils=True,
 )

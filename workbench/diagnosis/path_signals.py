@@ -96,6 +96,16 @@ class Signals:
         """Gradient energy over squared mean grey, 1/px², which a longer exposure does not change."""
         return self.gradient_energy / np.maximum(self.mean_grey, 1.0) ** 2
 
+    @functools.cached_property
+    def texture(self) -> Floats:
+        """Sharpness without the part of the noise.
+
+        Noise of σ leaves a residual of √2 σ between two frames and has a squared gradient of 4 σ².
+        """
+        noise = 2.0 * usual(self.residual) ** 2
+        left = np.maximum(self.gradient_energy - noise, 0.05 * self.gradient_energy)
+        return np.asarray(left / np.maximum(self.mean_grey, 1.0) ** 2)
+
     # ---- the motion
 
     @functools.cached_property
