@@ -16,9 +16,18 @@ from workbench.diagnosis.path_signals import USUAL_FRAMES, Signals, extended, la
 
 
 def _exposed(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
-    change = np.abs(signals.brightening)
-    jumps = np.abs(np.diff(signals.mean_grey, prepend=signals.mean_grey[:1])) > bounds["min_change_grey"]
-    return extended(jumps & (change > bounds["min_change_grey"]), change > bounds["min_change_grey"])
+    """The same ground is brighter or darker at once; up to the return, where there is one soon."""
+    bound, grey = bounds["min_change_grey"], signals.mean_grey
+    change = np.diff(grey, prepend=grey[:1])
+    true = signals.residual < bounds["residual_factor"] * usual(signals.residual)
+    differs = np.abs(signals.brightening) > bound
+    jumps = (np.abs(change) > bound) & differs & true
+    found = extended(jumps, differs & true)
+    for k in np.flatnonzero(jumps & ~before):
+        back = np.flatnonzero(np.sign(change[k]) * (grey[k:] - grey[k] + change[k] / 2) < 0)
+        if len(back) and back[0] < USUAL_FRAMES // 2:
+            found[k : k + int(back[0])] = True
+    return found
 
 
 def _tell_exposure(shown: Shown) -> Told:
@@ -42,7 +51,7 @@ EXPOSURE = Mode(
     cause="the camera's automatic exposure, a lamp, or a shadow",
     remedy="fix the exposure of the camera; gain_and_offset = true with refiner = inverse-compositional takes it out, "
     "a wider accepted_gain lets stronger jumps through",
-    thresholds={"min_change_grey": 8.0},
+    thresholds={"min_change_grey": 8.0, "residual_factor": 3.5},
     shows=_exposed,
     strength=lambda signals, _: np.abs(signals.brightening),
     tell=_tell_exposure,
@@ -53,7 +62,10 @@ def _blurred(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     """Sharpness and gain of the match fall at once, until the sharpness is back; or the peak is long as well as low."""
     sharpness, ratio = signals.texture, signals.sharpness / usual(signals.sharpness)
     faded = signals.gain < bounds["gain_ratio"] * usual(signals.gain)
-    fell = sharpness < bounds["step_ratio"] * np.concatenate([sharpness[:1], sharpness[:-1]])
+    faded &= signals.gain < bounds["contrast"] * signals.correlation  # gain over correlation: contrast over template's
+    raw = signals.sharpness  # that of noise and texture together falls slowly where the ground changes
+    fell = (sharpness[1:] < bounds["step_ratio"] * sharpness[:-1]) & (raw[1:] < bounds["raw_step_ratio"] * raw[:-1])
+    fell = np.concatenate([[False], fell])
     sound = signals.residual < bounds["residual_factor"] * usual(signals.residual)
     smoothed = scipy.ndimage.median_filter(sharpness, 3)
     onset = np.flatnonzero(fell & faded & previous(sound) & ~before)
@@ -91,12 +103,14 @@ BLUR = Mode(
     remedy="shorten the exposure or add light; a larger fragment_side_px stands more blur",
     thresholds={
         "step_ratio": 0.85,
+        "raw_step_ratio": 0.92,
         "gain_ratio": 0.85,
         "back_ratio": 0.85,
         "sharpness_ratio": 0.5,
         "anisotropy_factor": 2.0,
-        "min_correlation": 0.6,
+        "min_correlation": 0.7,
         "residual_factor": 1.5,
+        "contrast": 0.95,
         "min_frames": 3,
     },
     shows=_blurred,
@@ -122,7 +136,9 @@ def _held(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
 def _noisy(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     """White noise of σ leaves residuals of σ to √2 σ and adds four times σ² to the squared gradient."""
     residual = signals.residual
-    rough = (_roughness(signals) > bounds["gradient_share"] * residual**2) & ~_held(signals, bounds, before)
+    added = _roughness(signals)
+    rough = (added > bounds["gradient_share"] * residual**2) & ~_held(signals, bounds, before)
+    rough &= added > bounds["added_share"] * usual(signals.gradient_energy)
     high = residual > bounds["residual_factor"] * usual(residual)
     return extended(high & rough, rough & (residual > bounds["weak_residual_factor"] * usual(residual)))
 
@@ -156,6 +172,7 @@ NOISE = Mode(
     thresholds={
         "residual_factor": 1.8,
         "weak_residual_factor": 1.3,
+        "added_share": 0.15,
         "gradient_share": 1.0,
         "still_share": 0.3,
         "min_speed_px": 1.0,
@@ -172,10 +189,12 @@ def _dirty(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     residual = signals.residual / usual(np.where(before, np.nan, signals.residual))
     poor = (residual > bounds["residual_factor"]) & (signals.template_row >= 0)
     smooth = _roughness(signals) < bounds["gradient_share"] * signals.residual**2
-    matched = signals.correlation > bounds["min_correlation"]
+    rigid = np.abs(signals.case["scale"] - 1.0) < bounds["max_scale_change"]  # another height leaves much over as well
+    matched = rigid & (signals.correlation > bounds["min_correlation"])
     always = (residual > bounds["always_factor"]) & poor[signals.template_row] & smooth & matched
-    weak = (poor & smooth) | signals.case.rings(Verdict.REACQUIRED | Verdict.LOST)
-    return extended(((_held(signals, bounds, before) & poor) | always) & ~before, weak & ~before)
+    held = _held(signals, bounds, before) & (residual > bounds["held_factor"])
+    weak = (poor & smooth) | held | signals.case.rings(Verdict.REACQUIRED | Verdict.LOST)
+    return extended((held | always) & ~before, weak & ~before)
 
 
 def _tell_dirt(shown: Shown) -> Told:
@@ -208,9 +227,11 @@ DIRT = Mode(
     thresholds={
         "still_share": 0.3,
         "min_speed_px": 1.0,
+        "held_factor": 1.3,
         "residual_factor": 1.6,
         "always_factor": 2.5,
         "gradient_share": 0.8,
+        "max_scale_change": 0.01,
         "min_correlation": 0.4,
     },
     shows=_dirty,
@@ -226,6 +247,7 @@ DIRT = Mode(
 def _striped(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     condition = signals.case["condition"]  # infinite where there is no texture at all, which is another thing
     share = np.mean(np.isfinite(condition) & (condition > bounds["condition"]), axis=1)
+    share = np.where(signals.mean_grey < bounds["max_grey"], share, 0.0)  # a bleached image has few gradients as well
     return extended(share > bounds["share"], share > bounds["weak_share"])
 
 
@@ -247,7 +269,7 @@ APERTURE = Mode(
     cause="stripes, planks, kerbs or a grating: along them one place looks like the next",
     remedy="use fragments that reach beyond the stripes: more columns and rows, wider span_u_px and span_v_px, a "
     "larger fragment_side_px; or a camera that sees more of the ground",
-    thresholds={"condition": 9.0, "share": 0.5, "weak_share": 0.2},
+    thresholds={"max_grey": 225.0, "condition": 9.0, "share": 0.5, "weak_share": 0.2},
     shows=_striped,
     strength=lambda signals, _: signals.condition,
     tell=_tell_stripes,
@@ -291,10 +313,10 @@ REPETITIVE = Mode(
     "in reach; or a fragment_side_px larger than the period",
     thresholds={
         "peak_ratio": 0.9,
-        "share": 0.5,
+        "share": 0.6,
         "weak_share": 0.3,
         "min_apart_px": 4.5,
-        "min_frames": 3,
+        "min_frames": 4,
         "min_correlation": 0.7,
     },
     shows=_repeating,

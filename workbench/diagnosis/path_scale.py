@@ -31,13 +31,15 @@ def height_against_scale(signals: Signals, before: Bools) -> Floats:
     The size of the ground's content in the image, from template to template, times W is constant while W follows
     the height. Frames that something else explains count as if nothing changed, and a steady tilt is taken out.
     """
-    case, used = signals.case, signals.accepted & ~before
+    case, used, slope = signals.case, signals.agreeing & ~before, tilt_slope(signals, before)
     step = np.where(used, np.log(np.where(used, case["scale"], 1.0)), 0.0)
-    step -= np.where(used, tilt_slope(signals, before) * case["centre_shift_px"][:, 0], 0.0)
     base = np.where(used & (signals.template_row >= 0), signals.template_row, np.arange(len(step)) - 1)
-    size = np.zeros(len(step))
+    size, way = np.zeros(len(step)), np.zeros(len(step))
     for k in range(1, len(step)):
         size[k] = size[base[k]] + step[k]
+        way[k] = way[base[k]] + (case["centre_shift_px"][k, 0] if used[k] else 0.0)
+    if slope:
+        size -= np.polynomial.Polynomial.fit(way, size, 1)(way)
     size += np.log(case["metres_per_px"])
     return np.asarray(usual(size) - size)
 

@@ -41,6 +41,12 @@ class Signals:
         return ~self.case.rings(SKIPPED)
 
     @functools.cached_property
+    def agreeing(self) -> Bools:
+        """At least half of the fragments agree on one motion, whether it was used or not."""
+        count = self.case["peak_correlation"].shape[1]
+        return np.asarray(self.compared & (2 * self.case["inliers"] >= count))
+
+    @functools.cached_property
     def template_row(self) -> Ints:
         """Row of the frame that it was compared with, -1 for none."""
         wanted, frames = self.case["template_frame"], self.case.frame
@@ -94,7 +100,7 @@ class Signals:
     @functools.cached_property
     def sharpness(self) -> Floats:
         """Gradient energy over squared mean grey, 1/px², which a longer exposure does not change."""
-        return self.gradient_energy / np.maximum(self.mean_grey, 1.0) ** 2
+        return np.asarray(self.gradient_energy / np.maximum(self.mean_grey, 1.0) ** 2)
 
     @functools.cached_property
     def texture(self) -> Floats:
