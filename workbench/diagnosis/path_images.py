@@ -21,7 +21,8 @@ def _exposed(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     change = np.diff(grey, prepend=grey[:1])
     true = signals.residual < bounds["residual_factor"] * usual(signals.residual)
     differs = np.abs(signals.brightening) > bound
-    jumps = (np.abs(change) > bound) & differs & true
+    clipped = (grey > bounds["max_grey"]) | (grey < bounds["min_grey"])  # nothing is left to compare
+    jumps = (np.abs(change) > bound) & ((differs & true) | clipped)
     found = extended(jumps, differs & true)
     for k in np.flatnonzero(jumps & ~before):
         back = np.flatnonzero(np.sign(change[k]) * (grey[k:] - grey[k] + change[k] / 2) < 0)
@@ -51,9 +52,9 @@ EXPOSURE = Mode(
     cause="the camera's automatic exposure, a lamp, or a shadow",
     remedy="fix the exposure of the camera; gain_and_offset = true with refiner = inverse-compositional takes it out, "
     "a wider accepted_gain lets stronger jumps through",
-    thresholds={"min_change_grey": 8.0, "residual_factor": 3.5},
+    thresholds={"min_change_grey": 8.0, "residual_factor": 3.5, "max_grey": 245.0, "min_grey": 10.0},
     shows=_exposed,
-    strength=lambda signals, _: np.abs(signals.brightening),
+    strength=lambda signals, _: np.nan_to_num(np.abs(signals.brightening)),
     tell=_tell_exposure,
 )
 
@@ -67,6 +68,7 @@ def _blurred(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     fell = (sharpness[1:] < bounds["step_ratio"] * sharpness[:-1]) & (raw[1:] < bounds["raw_step_ratio"] * raw[:-1])
     fell = np.concatenate([[False], fell])
     sound = signals.residual < bounds["residual_factor"] * usual(signals.residual)
+    sound &= signals.correlation > bounds["sound_correlation"] * usual(signals.correlation)
     smoothed = scipy.ndimage.median_filter(sharpness, 3)
     onset = np.flatnonzero(fell & faded & previous(sound) & ~before)
     found = np.zeros(len(sharpness), dtype=bool)
@@ -111,6 +113,7 @@ BLUR = Mode(
         "min_correlation": 0.7,
         "residual_factor": 1.5,
         "contrast": 0.95,
+        "sound_correlation": 0.6,
         "min_frames": 3,
     },
     shows=_blurred,
@@ -140,6 +143,7 @@ def _noisy(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     rough = (added > bounds["gradient_share"] * residual**2) & ~_held(signals, bounds, before)
     rough &= added > bounds["added_share"] * usual(signals.gradient_energy)
     high = residual > bounds["residual_factor"] * usual(residual)
+    high &= np.abs(signals.case["scale"] - 1.0) < bounds["max_scale_change"]  # another height leaves much over as well
     return extended(high & rough, rough & (residual > bounds["weak_residual_factor"] * usual(residual)))
 
 
@@ -172,6 +176,7 @@ NOISE = Mode(
     thresholds={
         "residual_factor": 1.8,
         "weak_residual_factor": 1.3,
+        "max_scale_change": 0.01,
         "added_share": 0.15,
         "gradient_share": 1.0,
         "still_share": 0.3,
@@ -189,7 +194,7 @@ def _dirty(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     residual = signals.residual / usual(np.where(before, np.nan, signals.residual))
     poor = (residual > bounds["residual_factor"]) & (signals.template_row >= 0)
     smooth = _roughness(signals) < bounds["gradient_share"] * signals.residual**2
-    rigid = np.abs(signals.case["scale"] - 1.0) < bounds["max_scale_change"]  # another height leaves much over as well
+    rigid = np.abs(signals.case["scale"] - 1.0) < bounds["max_scale_change"]  # as in noise
     matched = rigid & (signals.correlation > bounds["min_correlation"])
     always = (residual > bounds["always_factor"]) & poor[signals.template_row] & smooth & matched
     held = _held(signals, bounds, before) & (residual > bounds["held_factor"])
