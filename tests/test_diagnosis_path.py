@@ -300,3 +300,14 @@ def test_the_matrix_in_the_docs_meets_the_bar() -> None:
     assert {row[1].strip() for row in rows} == set(TABLE) - {CLEAN}
     assert all(int(row[4]) == 20 and float(row[5]) >= 0.95 and float(row[6]) >= 0.95 for row in rows)
     assert 'severity "error" in 20 clean missions: 0' in page
+
+
+def test_the_example_of_a_rule_runs() -> None:
+    page = (Path(__file__).parents[1] / "docs" / "diagnosis.md").read_text(encoding="utf-8")
+    (block,) = [text for text in page.split("```")[1::2] if text.startswith("python") and "dark-image" in text]
+    names: dict[str, object] = {}
+    exec(block.removeprefix("python"), names)
+    rule = names["DARK"]
+    assert isinstance(rule, Rule)
+    found = only(diagnose(case({k: {"mean_grey": 2.0} for k in (40, 41)}), [rule]))
+    assert (found.rule, found.spans) == ("dark-image", ((40, 41),))
