@@ -253,7 +253,7 @@ def _striped(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     condition = signals.case["condition"]  # infinite where there is no texture at all, which is another thing
     share = np.mean(np.isfinite(condition) & (condition > bounds["condition"]), axis=1)
     share = np.where(signals.mean_grey < bounds["max_grey"], share, 0.0)  # a bleached image has few gradients as well
-    return extended(share > bounds["share"], share > bounds["weak_share"])
+    return lasting(extended(share > bounds["share"], share > bounds["weak_share"]), int(bounds["min_frames"]))
 
 
 def _tell_stripes(shown: Shown) -> Told:
@@ -274,7 +274,7 @@ APERTURE = Mode(
     cause="stripes, planks, kerbs or a grating: along them one place looks like the next",
     remedy="use fragments that reach beyond the stripes: more columns and rows, wider span_u_px and span_v_px, a "
     "larger fragment_side_px; or a camera that sees more of the ground",
-    thresholds={"max_grey": 225.0, "condition": 9.0, "share": 0.5, "weak_share": 0.2},
+    thresholds={"max_grey": 225.0, "min_frames": 4, "condition": 9.0, "share": 0.5, "weak_share": 0.2},
     shows=_striped,
     strength=lambda signals, _: signals.condition,
     tell=_tell_stripes,
