@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,6 +86,7 @@ class Case:
         harm_m: what each frame adds to the end-point error [n], NaN where it is not known.
         facts: oddities of the recording's streams, a sentence each.
         get: the column [n, *shape] of a field by its name.
+        kept: what rules share, see `once`.
     """
 
     estimator: str
@@ -95,6 +97,14 @@ class Case:
     harm_m: Floats
     facts: Sequence[str]
     get: Callable[[str], NDArray[Any]] = field(repr=False)
+    kept: dict[Any, Any] = field(default_factory=dict, repr=False, compare=False)
+
+    def once(self, make: Callable[[Case], T]) -> T:
+        """What a function makes of this case, made only once however many rules ask for it."""
+        if make not in self.kept:
+            self.kept[make] = make(self)
+        kept: T = self.kept[make]
+        return kept
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """A field of all frames [n, *shape]."""
