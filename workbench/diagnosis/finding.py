@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, Self
+from typing import TYPE_CHECKING, Any, Self, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,6 +20,7 @@ if TYPE_CHECKING:
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 Bools = NDArray[np.bool_]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -85,6 +86,9 @@ class Case:
         harm_m: what each frame adds to the end-point error [n], NaN where it is not known.
         facts: oddities of the recording's streams, a sentence each.
         get: the column [n, *shape] of a field by its name.
+        reference_depth_m: of the range estimator: reference depth of the landmark in each slot [n, N], NaN where it is
+            not known; None where no reference tells any.
+        kept: what rules found out together, by name; see `once`.
     """
 
     estimator: str
@@ -95,6 +99,15 @@ class Case:
     harm_m: Floats
     facts: Sequence[str]
     get: Callable[[str], NDArray[Any]] = field(repr=False)
+    reference_depth_m: Floats | None = None
+    kept: dict[str, Any] = field(default_factory=dict, repr=False, compare=False)
+
+    def once(self, name: str, found_by: Callable[[Case], T]) -> T:
+        """What a function finds in the case, found once for all the rules that ask for it by that name."""
+        if name not in self.kept:
+            self.kept[name] = found_by(self)
+        found: T = self.kept[name]
+        return found
 
     def __getitem__(self, name: str) -> NDArray[Any]:
         """A field of all frames [n, *shape]."""
@@ -118,6 +131,7 @@ class Case:
             harm_m=np.full(len(run.frames), np.nan) if harm_m is None else harm_m,
             facts=tuple(run.summary.get("facts", ())),
             get=run.column,
+            reference_depth_m=run.reference_depths,
         )
 
     @classmethod
@@ -128,6 +142,7 @@ class Case:
         settings: Mapping[str, Any],
         reference: Trajectory | None = None,
         facts: Sequence[str] = (),
+        reference_depth_m: Floats | None = None,
     ) -> Self:
         """The case of steps in memory."""
         t_ns = np.array([step.t_ns for step in steps], np.int64)
@@ -147,6 +162,7 @@ class Case:
             harm_m=np.full(len(steps), np.nan),
             facts=facts,
             get=get,
+            reference_depth_m=reference_depth_m,
         )
 
 
