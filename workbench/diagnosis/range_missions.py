@@ -394,7 +394,7 @@ def replayed(name: str, seed: int, **settings: Any) -> Replayed:
     chosen = settings_of(plan)
     estimator = RangeFilter(chosen)
     state, steps = estimator.start(), list[RangeStep]()
-    for sample in mission_of(plan, seed).read(STREAMS):
+    for sample in mission_of(plan, int(rng_of(seed, name, "noise").integers(1 << 62))).read(STREAMS):
         state, step = estimator.step(state, sample)
         if step is not None:
             steps.append(step)
