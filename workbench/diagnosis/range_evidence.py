@@ -30,6 +30,12 @@ MAD = 1.4826
 """Standard deviation of a normal distribution over its median absolute deviation."""
 THIRD_DIFFERENCE = math.sqrt(20.0)
 """σ of x₃ - 3x₂ + 3x₁ - x₀ of white noise of σ 1."""
+QUIET_NIS = 6.0
+"""Median NIS of a frame below which its landmarks are in place."""
+AGE_INTERVALS = 1.5
+"""Intervals between frames beyond which the age of an input, above its usual one, means that messages are missing."""
+FEWEST_INPUTS = 0.5
+"""Share of the usual messages of the inputs below which some are missing."""
 REGULAR = 0.25
 """Intervals that differ more from the usual one are left out of third differences."""
 BLUNDER = 6.0
@@ -86,6 +92,8 @@ class Drive:
         camera: the camera.
         ids: landmark in each slot [n, N], -1 for none.
         pixel: its measured image point [n, N, 2], NaN for none.
+        blunder: it is far off while most of its frame's are not [n, N].
+        blind: no new speed or rate of turn came for the frame [n].
         dt: time since the frame before [n], 0 of the first and of frames that were passed over.
         turn: turn of the camera since then, camera axes, as `Rotation.as_matrix` [n, 3, 3]: P' = turn P - shift.
         shift: way since then in the new axes [n, 3].
@@ -95,6 +103,8 @@ class Drive:
     camera: Camera
     ids: Ints
     pixel: Floats
+    blunder: Bools
+    blind: Bools
     dt: Floats
     turn: Floats
     shift: Floats
@@ -136,11 +146,21 @@ def _drive(case: Case) -> Drive:
     way = (np.nan_to_num(case["speed_mps"]) * dt)[:, None] * camera.rays(focus)
     turn = Rotation.from_rotvec(angle).as_matrix()
     half = Rotation.from_rotvec(angle / 2).as_matrix()
+    known = dt[dt > 0.0]
+    usual = float(np.median(known)) if len(known) else math.nan
+    blind = np.zeros(len(dt), bool)
+    for age in (case["gyro_age_s"], case["odometer_age_s"]):
+        blind |= age > AGE_INTERVALS * usual + np.nanmedian(age)
+    a_second = case["intervals"] / np.where(dt > 0.0, dt, np.nan)
+    with np.errstate(invalid="ignore"):
+        blind |= a_second < FEWEST_INPUTS * np.nanmedian(a_second)
     return Drive(
         settings,
         camera,
         np.nan_to_num(case["landmark_id"], nan=-1.0).astype(np.int64),
         case["measured_px"],
+        blunders(case, BLUNDER**2),
+        blind,
         dt,
         turn,
         np.einsum("nij,nj->ni", half, way),
@@ -299,6 +319,9 @@ def _pairs(case: Case, length_s: float, every_s: float) -> list[Pair]:
 def _pair(run: Drive, first: int, last: int, sigma_px: float) -> Pair | None:
     """r₂ᵀ [t]ₓ R r₁ = 0 for each landmark, linearised in a turn and in the direction of the way."""
     slots = run.shared(first, last)
+    slots = slots[~(run.blunder[first, slots] | run.blunder[last, slots])]
+    if run.blind[first + 1 : last + 1].any():
+        return None
     turn, shift = run.between(first, last)
     if len(slots) < FEWEST or not np.linalg.norm(shift) > 0.0:
         return None
@@ -386,6 +409,24 @@ def depth_at(run: Drive, slot: int, first: int, last: int, sigma_px: float) -> t
     turned = run.settings.sigma_omega * math.sqrt(seconds)
     sigma = math.hypot(math.sqrt(2.0) * sigma_px / run.camera.focal_px, turned)
     return float(across[0] @ across[1]) / lever, sigma * float(np.linalg.norm(now)) / math.sqrt(lever)
+
+
+def median_nis(case: Case) -> Floats:
+    """Median NIS of the landmarks in each frame [n], NaN where none was measured."""
+    return case.once("range median nis", _median_nis)
+
+
+def _median_nis(case: Case) -> Floats:
+    nis = np.where(updated(case), case["nis"], np.nan)
+    out = np.full(len(nis), np.nan)
+    some = np.isfinite(nis).any(axis=1)
+    out[some] = np.nanmedian(nis[some], axis=1)
+    return out
+
+
+def blunders(case: Case, nis: float, quiet: float = QUIET_NIS) -> Bools:
+    """Image points [n, N] of a larger NIS than that in frames whose median NIS is below the quiet one."""
+    return np.asarray(updated(case) & (case["nis"] > nis) & (median_nis(case) < quiet)[:, None])
 
 
 def updated(case: Case) -> Bools:

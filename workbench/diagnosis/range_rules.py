@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,10 +26,8 @@ Bounds = Mapping[str, float]
 DEG = math.degrees(1.0)
 MARGIN = 2
 """Frames beside those of a cause whose oddities it explains too."""
-EXPLAINED = 0.5
-"""Share of a claim's frames that a cause must cover to take all of it."""
-EXPLAINED_WHOLE = 0.15
-"""The same for what was found of the run as a whole: a part that is otherwise wrong spoils it."""
+EXPLAINED = 0.15
+"""Share of a stretch of frames that a cause must cover to take all of it."""
 MEDIAN_CHI2 = 1.386
 """Median of χ² with two degrees of freedom."""
 SHOWN = 6
@@ -45,14 +43,12 @@ class Claim:
         worst: the row to look at.
         sentence: what happened.
         evidence: the numbers that show it.
-        whole: it was found of the run as a whole.
     """
 
     rows: Bools
     worst: int
     sentence: str
     evidence: tuple[Evidence, ...]
-    whole: bool = False
 
 
 Claims = Iterator[Claim]
@@ -94,15 +90,6 @@ def _seconds(case: Case, rows: Bools) -> float:
     return float(rows.sum()) * looks.drive(case).usual_dt
 
 
-def _median_nis(case: Case) -> Floats:
-    """Median NIS of the landmarks in each frame [n], NaN where none was measured."""
-    nis = np.where(looks.updated(case), case["nis"], np.nan)
-    out = np.full(len(nis), np.nan)
-    some = np.isfinite(nis).any(axis=1)
-    out[some] = np.nanmedian(nis[some], axis=1)
-    return out
-
-
 def _all(case: Case) -> Bools:
     return np.ones(len(case.frame), bool)
 
@@ -116,18 +103,16 @@ def _gaps(case: Case, bounds: Bounds) -> Bools:
     return np.asarray(run.dt > bounds["gap_factor"] * run.usual_dt)
 
 
-def _starved(case: Case, bounds: Bounds) -> tuple[Bools, Floats]:
-    """Frames since whose predecessor fewer messages of the inputs came than usual, and the share that came [n]."""
+def _inputs_that_came(case: Case) -> Floats:
+    """Messages of the inputs since the frame before over the usual number for that time [n]."""
     run = looks.drive(case)
     a_second = case["intervals"] / np.where(run.dt > 0.0, run.dt, np.nan)
-    share = a_second / _median(a_second)
-    return np.asarray(share < bounds["fewest_share"]), np.asarray(share)
+    return np.asarray(a_second / _median(a_second))
 
 
 def _dropped_motion(case: Case, bounds: Bounds) -> Claims:
-    gaps = _gaps(case, bounds)
-    starved, share = _starved(case, bounds)
-    rows = gaps & starved
+    share = _inputs_that_came(case)
+    rows = _gaps(case, bounds) & (share < bounds["fewest_share"])
     if rows.any():
         run = looks.drive(case)
         worst = int(np.argmax(np.where(rows, run.dt, 0.0)))
@@ -136,7 +121,7 @@ def _dropped_motion(case: Case, bounds: Bounds) -> Claims:
             worst=worst,
             sentence=f"no image and hardly a speed or rate of turn came for {run.dt[worst]:.2f} s: the last ones were "
             f"held over {int(case['intervals'][worst])} intervals, where usually "
-            f"{_median(case['intervals'] / run.dt[:, None].T[0]) * run.dt[worst]:.0f} tell the motion",
+            f"{case['intervals'][worst] / share[worst]:.0f} tell the motion",
             evidence=(
                 Evidence(name="dt_s", value=run.dt[worst], unit="s", usual=run.usual_dt,
                          bound=bounds["gap_factor"] * run.usual_dt),
@@ -216,7 +201,7 @@ def _swapped_stamps(case: Case, bounds: Bounds) -> Claims:
             Evidence(name="step on the image over the predicted one", value=float(found.ratio[worst]),
                      usual=_median(found.ratio[telling]), bound=bounds["back"]),
             Evidence(name="its σ", value=float(found.ratio_sigma[worst])),
-            Evidence(name="nis", value=float(_median_nis(case)[worst]), usual=_median(_median_nis(case)),
+            Evidence(name="nis", value=float(looks.median_nis(case)[worst]), usual=_median(looks.median_nis(case)),
                      bound=MEDIAN_CHI2),
         ),
     )  # fmt: skip
@@ -238,10 +223,11 @@ def _late_images(case: Case, bounds: Bounds) -> Claims:
             continue
         turn = found.turn_rad[rows]
         kept = rows[np.abs(turn - np.median(turn)) <= 4.0 * max(looks.spread(turn), float(np.median(noise[rows])))]
-        total = float(change[kept] @ change[kept])
+        swing = change[kept] - change[kept].mean()  # a bias of the gyro is no delay
+        total = float(swing @ swing)
         if total > 0.0:
-            delay[k] = -float(found.turn_rad[kept] @ change[kept]) / total
-            rest = found.turn_rad[kept] + delay[k] * change[kept]
+            delay[k] = -float(found.turn_rad[kept] @ swing) / total
+            rest = found.turn_rad[kept] - found.turn_rad[kept].mean() + delay[k] * swing
             scale = max(float(np.sqrt(np.mean(rest**2))), _median(noise[kept]))
             sigma[k] = scale / math.sqrt(total)
     rows = (np.abs(delay) > bounds["sigmas"] * sigma) & (np.abs(delay) > bounds["delay_s"])
@@ -250,7 +236,8 @@ def _late_images(case: Case, bounds: Bounds) -> Claims:
         return
     worst = int(np.argmax(np.where(rows, np.abs(delay) / sigma, 0.0)))
     late = float(np.median(delay[rows]))
-    nis = _median_nis(case)
+    rows = _to_jumps(run, rows, late, half)
+    nis = looks.median_nis(case)
     yield Claim(
         rows=rows,
         worst=worst,
@@ -266,28 +253,36 @@ def _late_images(case: Case, bounds: Bounds) -> Claims:
     )  # fmt: skip
 
 
+def _to_jumps(run: looks.Drive, rows: Bools, late_s: float, reach: int) -> Bools:
+    """The rows, led to where the stamps jump by the delay: there the interval is longer, at the end shorter by it."""
+    out = np.zeros(len(rows), bool)
+    off = run.dt - run.usual_dt
+    close = max(0.3 * abs(late_s), 0.005)
+    for first, last in spans_of(np.arange(len(rows)), rows, bridge=reach):
+        begins = np.flatnonzero(np.abs(off - late_s) < close)
+        ends = np.flatnonzero((np.abs(off + late_s) < close) & (run.dt > 0.0))
+        begins = begins[np.abs(begins - first) <= 1.5 * reach]
+        ends = ends[(np.abs(ends - last) <= 1.5 * reach) & (ends > first)]
+        begin = int(begins[np.argmin(np.abs(begins - first))]) if len(begins) else first
+        end = int(ends[np.argmin(np.abs(ends - last))]) if len(ends) else last
+        out[begin : end + 1] = True
+    return out
+
+
 # ------------------------------------------------------------------------------- the tracks
 
 
-def _individual(case: Case, bounds: Bounds) -> Bools:
-    """Image points [n, N] that are far off while most of the same frame are not."""
-    seen = looks.updated(case)
-    nis = np.where(seen, case["nis"], np.nan)
-    quiet = _median_nis(case) < bounds["others_nis"]
-    return np.asarray((nis > bounds["nis"]) & quiet[:, None])
-
-
 def _track_slip(case: Case, bounds: Bounds) -> Claims:
-    """The same landmark is off by the same vector several times in a row."""
+    """The same landmark is off by the same vector several times in a row, all of a sudden."""
     seen, innovation = looks.updated(case), case["innovation_px"]
     gate = looks.drive(case).settings.gate
-    limit = bounds["nis"] if gate == "off" else float(gate)
-    quiet = _median_nis(case) < bounds["others_nis"]
+    limit = bounds["nis"] if gate == "off" else max(float(gate), bounds["nis"])
+    quiet = looks.median_nis(case) < bounds["others_nis"]
     off = seen & (case["nis"] > limit) & quiet[:, None]
     ids = case["landmark_id"]
     rows_of: dict[int, list[int]] = {}
     shift_of: dict[int, float] = {}
-    few = int(bounds["in_a_row"])
+    few, noise_px = int(bounds["in_a_row"]), looks.track_noise(case).shown_px
     for slot in range(ids.shape[1]):
         where = np.flatnonzero(seen[:, slot])
         for a in range(len(where) - few + 1):
@@ -297,7 +292,11 @@ def _track_slip(case: Case, bounds: Bounds) -> Claims:
             vectors = innovation[rows, slot]
             mean = vectors.mean(axis=0)
             size = float(np.linalg.norm(mean))
-            if np.abs(vectors - mean).max() < max(bounds["alike"] * size, bounds["alike_px"]):
+            if (case["outcome"][where[max(0, a - 2) : a], slot] == Outcome.RESET).any():
+                continue  # back from where blunders in a row had led it
+            alike = np.abs(vectors - mean).max() < max(bounds["alike"] * size, bounds["alike_noise"] * noise_px)
+            before = float(np.linalg.norm(innovation[where[a - 1], slot])) if a else math.inf
+            if alike and before < bounds["before"] * size:
                 number = int(ids[rows[0], slot])
                 rows_of.setdefault(number, []).extend(range(int(rows[0]), int(rows[-1]) + 1))
                 shift_of[number] = max(shift_of.get(number, 0.0), size)
@@ -315,8 +314,8 @@ def _track_slip(case: Case, bounds: Bounds) -> Claims:
             evidence=(
                 Evidence(name=f"nis of landmark {number}", value=float(case["nis"][worst, slot]),
                          usual=_median(case["nis"][:, slot]), bound=limit),
-                Evidence(name="median NIS of the frame", value=float(_median_nis(case)[worst]),
-                         usual=_median(_median_nis(case)), bound=bounds["others_nis"]),
+                Evidence(name="median NIS of the frame", value=float(looks.median_nis(case)[worst]),
+                         usual=_median(looks.median_nis(case)), bound=bounds["others_nis"]),
                 Evidence(name="innovation_px", value=shift_of[number], unit="px",
                          usual=_median(np.linalg.norm(innovation[:, slot], axis=1))),
             ),
@@ -324,7 +323,7 @@ def _track_slip(case: Case, bounds: Bounds) -> Claims:
 
 
 def _track_outliers(case: Case, bounds: Bounds) -> Claims:
-    off = _individual(case, bounds)
+    off = looks.blunders(case, bounds["nis"], bounds["others_nis"])
     rows = np.asarray(off.any(axis=1))
     if not rows.any():
         return
@@ -372,11 +371,12 @@ def _overconfident_start(case: Case, bounds: Bounds) -> Claims:
         if off > bounds["sigmas"] and abs(told - begun) > bounds["share"] * max(told, begun) and told > 0.0:
             wrong.append((int(ids[first, slot]), 1.0 / begun, trusted / begun, 1.0 / told))
             rows |= (time >= time[first]) & (time <= time[first] + bounds["judged_s"])
+            rows[first : _last_reset(case, first, slot) + 1] = True
             if off > most:
                 worst, most = int(same[0]), off
     if len(wrong) < bounds["fewest"]:
         return
-    nis = _median_nis(case)
+    nis = looks.median_nis(case)
     number, begun, trusted, told = wrong[0]
     yield Claim(
         rows=rows,
@@ -390,8 +390,15 @@ def _overconfident_start(case: Case, bounds: Bounds) -> Claims:
     )
 
 
+def _last_reset(case: Case, first: int, slot: int) -> int:
+    """The row of the last reset of the landmark that started in a row; that row where it had none."""
+    same = case["landmark_id"][:, slot] == case["landmark_id"][first, slot]
+    found = np.flatnonzero(same & (case["outcome"][:, slot] == Outcome.RESET))
+    return int(found[-1]) if len(found) else first
+
+
 def _noise_claim(case: Case, sentence: str, bound: float) -> Claim:
-    noise, nis = looks.track_noise(case), _median_nis(case)
+    noise, nis = looks.track_noise(case), looks.median_nis(case)
     rows = np.isfinite(nis)
     return Claim(
         rows=rows,
@@ -402,7 +409,6 @@ def _noise_claim(case: Case, sentence: str, bound: float) -> Claim:
             Evidence(name="noise that the settings say", value=noise.taken_px, unit="px"),
             Evidence(name="median NIS", value=_median(nis), bound=MEDIAN_CHI2),
         ),
-        whole=True,
     )
 
 
@@ -432,7 +438,9 @@ def _input_noise_too_small(case: Case, bounds: Bounds) -> Claims:
     """All landmarks jump to one side together, to and fro, by more than the gyro's noise."""
     found, run = looks.steps(case), looks.drive(case)
     gyro = run.settings.sigma_omega * np.sqrt(run.dt)
-    off = found.turn_rad / np.hypot(found.turn_sigma_rad, gyro)
+    # changes from step to step: a bias is no noise; they hold three image points, one of them twice
+    off = np.full(len(run.dt), np.nan)
+    off[1:] = np.diff(found.turn_rad) / np.sqrt(3.0 * found.turn_sigma_rad[1:] ** 2 + gyro[1:] ** 2 + gyro[:-1] ** 2)
     half = max(10, round(0.5 * bounds["window_s"] / run.usual_dt))
     ratio = np.full(len(off), np.nan)
     for k in range(len(off)):
@@ -444,14 +452,14 @@ def _input_noise_too_small(case: Case, bounds: Bounds) -> Claims:
         return
     shown = looks.spread(found.turn_rad[rows] / np.sqrt(np.where(run.dt[rows] > 0.0, run.dt[rows], np.nan)))
     worst = int(np.argmax(np.where(rows, np.abs(np.nan_to_num(off)), 0.0)))
-    nis = _median_nis(case)
+    nis = looks.median_nis(case)
     yield Claim(
         rows=rows,
         worst=worst,
         sentence=f"from frame to frame all landmarks jump aside together as by a rate of turn that is noisy by "
         f"{shown:.2g} rad/s/√Hz, the filter takes {run.settings.sigma_omega:.2g}: its uncertainties are too small",
         evidence=(
-            Evidence(name="turn of the image less the gyro's, in σ", value=float(off[worst]), usual=looks.spread(off),
+            Evidence(name="change of the image's turn less the gyro's, in σ", value=float(off[worst]), usual=looks.spread(off),
                      bound=bounds["ratio"]),
             Evidence(name="gyro's noise that the image shows", value=shown, unit="rad/s/√Hz",
                      usual=run.settings.sigma_omega),
@@ -485,7 +493,7 @@ def _gyro_bias(case: Case, bounds: Bounds) -> Claims:
         return
     bias = -float(np.median(rates))
     rest = _rest_rate(case)
-    nis = _median_nis(case)
+    nis = looks.median_nis(case)
     evidence = [
         Evidence(name="gyro less image, rate of turn to the right", value=bias, unit="rad/s",
                  usual=-_median(told[:, 0]), bound=bounds["bias_radps"]),
@@ -521,7 +529,7 @@ def _wrong_mounting(case: Case, bounds: Bounds) -> Claims:
     size = math.hypot(x, y)
     if size < bounds["off_px"]:
         return
-    nis = _median_nis(case)
+    nis = looks.median_nis(case)
     distance = _median(np.where(looks.updated(case), case["focus_distance_px"], np.nan))
     focal = run.camera.focal_px
     yield Claim(
@@ -538,7 +546,6 @@ def _wrong_mounting(case: Case, bounds: Bounds) -> Claims:
             Evidence(name="the same as an angle", value=DEG * size / focal, unit="°"),
             Evidence(name="median NIS (shows nothing)", value=_median(nis), usual=MEDIAN_CHI2),
         ),
-        whole=True,
     )  # fmt: skip
 
 
@@ -575,7 +582,6 @@ def _odometer_scale(case: Case, bounds: Bounds) -> Claims:
             Evidence(name="its spread over landmarks", value=alike, bound=bounds["alike"] * abs(scale)),
             Evidence(name="what the odometer's noise explains", value=by_noise),
         ),
-        whole=True,
     )
 
 
@@ -712,19 +718,20 @@ DETECTORS: Mapping[str, Detect] = {
 }
 
 _STAMPS = ("dropped-motion", "missing-inputs", "swapped-stamps", "late-images")
-_COMMON = (*_STAMPS, "input-noise-too-small", "overconfident-start", "measurement-noise-too-small")
+_COMMON = (*_STAMPS, "input-noise-too-small", "overconfident-start", "measurement-noise-too-small", "gyro-bias",
+           "wrong-mounting")
 CAUSES: Mapping[str, tuple[str, ...]] = {
     "missing-inputs": ("dropped-motion",),
-    "dropped-frames": ("dropped-motion",),
+    "dropped-frames": ("dropped-motion", "late-images"),
     "late-images": ("dropped-motion", "missing-inputs", "swapped-stamps"),
     "input-noise-too-small": _STAMPS,
     "gyro-bias": (*_STAMPS, "input-noise-too-small"),
     "wrong-mounting": (*_STAMPS, "input-noise-too-small", "gyro-bias"),
-    "track-slip": (*_COMMON, "gyro-bias"),
-    "track-outliers": (*_COMMON, "gyro-bias", "track-slip"),
+    "track-slip": _COMMON,
+    "track-outliers": (*_COMMON, "track-slip"),
     "near-focus": ("pure-rotation",),
     "standstill": ("pure-rotation",),
-    "odometer-scale": (*_COMMON, "gyro-bias", "wrong-mounting"),
+    "odometer-scale": _COMMON,
 }
 """Which more specific causes take the frames of a rule: what it sees there is their consequence."""
 
@@ -742,15 +749,19 @@ def _left(case: Case, rule: Rule) -> list[Claim]:
     for cause in CAUSES.get(rule.name, ()):
         for claim in _claims(case, _BY_NAME[cause]):
             taken |= _grown(claim.rows, MARGIN)
-    left = []
-    for claim in made:
-        share = float((claim.rows & taken).sum() / max(claim.rows.sum(), 1))
-        if share >= (EXPLAINED_WHOLE if claim.whole else EXPLAINED):
-            continue
-        rows = claim.rows & ~taken
-        worst = claim.worst if rows[claim.worst] else int(np.flatnonzero(rows)[0])
-        left.append(Claim(rows=rows, worst=worst, sentence=claim.sentence, evidence=claim.evidence, whole=claim.whole))
-    return left
+    return [left for left in (_without(claim, taken) for claim in made) if left is not None]
+
+
+def _without(claim: Claim, taken: Bools) -> Claim | None:
+    """What remains of a claim: its stretches of frames that are not taken, each whole or not at all."""
+    rows = np.zeros(len(taken), bool)
+    for first, last in spans_of(np.arange(len(taken)), claim.rows):
+        stretch = slice(first, last + 1)
+        if taken[stretch].mean() < EXPLAINED:
+            rows[stretch] = claim.rows[stretch] & ~taken[stretch]
+    if not rows.any():
+        return None
+    return replace(claim, rows=rows, worst=claim.worst if rows[claim.worst] else int(np.flatnonzero(rows)[0]))
 
 
 def _find(case: Case, rule: Rule) -> Iterable[Finding]:
@@ -870,7 +881,7 @@ RULES: tuple[Rule, ...] = (
         Severity.WARNING,
         "the tracker went over to another point: an edge in front of another, a repeated pattern",
         "reset_after = 3 starts the range anew (0 never does); check tracks forwards and backwards in the tracker",
-        nis=25.0, others_nis=6.0, in_a_row=3, alike=0.35, alike_px=2.5,
+        nis=25.0, others_nis=6.0, in_a_row=3, alike=0.1, alike_noise=5.0, before=0.4,
     ),
     _rule(
         "track-outliers",
