@@ -157,7 +157,7 @@ def _times(rng: Dice, length_s: tuple[float, float], first_s: float = 4.0, last_
 def _near_focus(rng: Dice) -> Plan:
     plan = plan_of(rng, straight(rng))
     places = plan.landmarks_m.copy()
-    off, way = rng.uniform(0.0, 3.0) * rng.uniform(14.0, 22.0) / FOCAL_PX, rng.uniform(0.0, 2.0 * math.pi)
+    off, way = rng.uniform(0.0, 2.0) * rng.uniform(14.0, 22.0) / FOCAL_PX, rng.uniform(0.0, 2.0 * math.pi)
     places[0] = [rng.uniform(14.0, 22.0), off * math.cos(way), HEIGHT_M + off * math.sin(way)]
     return dataclasses.replace(plan, landmarks_m=places)
 
@@ -234,10 +234,13 @@ def _swapped_stamps(rng: Dice) -> Plan:
 
 
 def _wrong_mounting(rng: Dice) -> Plan:
-    off, way = rng.uniform(6.0, 15.0), rng.uniform(0.0, 2.0 * math.pi)
+    off = rng.uniform(6.0, 15.0)
     kind = rng.integers(3)
     if kind == 0:
+        way = rng.choice([0.0, math.pi]) + rng.uniform(0.25, 0.75) * math.pi  # above or below rather than beside
         return plan_of(rng, settings={"centre_px": (CENTRE_PX[0] + off * math.cos(way), CENTRE_PX[1] + off * math.sin(way))})
+    if kind == 2:  # a yaw looks much like a turn: it takes more to be told
+        off = rng.uniform(12.0, 20.0)
     angle = float(rng.choice([-1.0, 1.0])) * off / FOCAL_PX
     return plan_of(rng, settings={"camera_pitch_rad" if kind == 1 else "camera_yaw_rad": angle})
 

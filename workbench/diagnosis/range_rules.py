@@ -28,6 +28,8 @@ MARGIN = 2
 """Frames beside those of a cause whose oddities it explains too."""
 EXPLAINED = 0.15
 """Share of a stretch of frames that a cause must cover to take all of it."""
+JUMP_REACH = 5
+"""Frames beyond half a window in which a jump of the stamps is looked for."""
 MEDIAN_CHI2 = 1.386
 """Median of χ² with two degrees of freedom."""
 SHOWN = 6
@@ -43,12 +45,14 @@ class Claim:
         worst: the row to look at.
         sentence: what happened.
         evidence: the numbers that show it.
+        whole: it was found of the run as a whole, so that causes take all of it or nothing.
     """
 
     rows: Bools
     worst: int
     sentence: str
     evidence: tuple[Evidence, ...]
+    whole: bool = False
 
 
 Claims = Iterator[Claim]
@@ -236,13 +240,14 @@ def _late_images(case: Case, bounds: Bounds) -> Claims:
         return
     worst = int(np.argmax(np.where(rows, np.abs(delay) / sigma, 0.0)))
     late = float(np.median(delay[rows]))
-    rows = _to_jumps(run, rows, late, half)
+    rows, jump = _to_jumps(run, rows, late, half)
+    jumps = f" (they jump by {1e3 * jump:.0f} ms)" if math.isfinite(jump) else ""
     nis = looks.median_nis(case)
     yield Claim(
         rows=rows,
         worst=worst,
         sentence=f"the images turn {1e3 * abs(late):.0f} ms {'after' if late > 0 else 'before'} the gyro: their stamps "
-        f"are {'late' if late > 0 else 'early'} by that; while turning at {DEG * np.abs(omega[rows]).max():.0f} °/s "
+        f"are {'late' if late > 0 else 'early'} by that or more{jumps}; while turning at {DEG * np.abs(omega[rows]).max():.0f} °/s "
         f"this moves the landmarks by up to {abs(late) * np.abs(omega[rows]).max() * run.camera.focal_px:.0f} px",
         evidence=(
             Evidence(name="delay of the images' stamps", value=float(delay[worst]), unit="s",
@@ -253,20 +258,26 @@ def _late_images(case: Case, bounds: Bounds) -> Claims:
     )  # fmt: skip
 
 
-def _to_jumps(run: looks.Drive, rows: Bools, late_s: float, reach: int) -> Bools:
-    """The rows, led to where the stamps jump by the delay: there the interval is longer, at the end shorter by it."""
-    out = np.zeros(len(rows), bool)
-    off = run.dt - run.usual_dt
-    close = max(0.3 * abs(late_s), 0.005)
+def _to_jumps(run: looks.Drive, rows: Bools, late_s: float, reach: int) -> tuple[Bools, float]:
+    """The rows, led to where the stamps jump: there an interval is longer by the delay, at the end shorter.
+
+    Also the size of the first such jump, s; NaN where there is none. The window tells less than the whole delay (the
+    filter has taken up part of it in its ranges), so that jumps from half of it to thrice as much count.
+    """
+    out, jump = np.zeros(len(rows), bool), math.nan
+    off = (run.dt - run.usual_dt) * math.copysign(1.0, late_s)
     for first, last in spans_of(np.arange(len(rows)), rows, bridge=reach):
-        begins = np.flatnonzero(np.abs(off - late_s) < close)
-        ends = np.flatnonzero((np.abs(off + late_s) < close) & (run.dt > 0.0))
-        begins = begins[np.abs(begins - first) <= 1.5 * reach]
-        ends = ends[(np.abs(ends - last) <= 1.5 * reach) & (ends > first)]
-        begin = int(begins[np.argmin(np.abs(begins - first))]) if len(begins) else first
-        end = int(ends[np.argmin(np.abs(ends - last))]) if len(ends) else last
-        out[begin : end + 1] = True
-    return out
+        size = abs(late_s)
+        begins = np.flatnonzero((off > 0.5 * size) & (off < 3.0 * size))
+        begins = begins[np.abs(begins - first) <= reach + JUMP_REACH]
+        if len(begins):
+            first = int(begins[np.argmin(np.abs(begins - first))])
+            jump = float(off[first]) if math.isnan(jump) else jump
+        ends = np.flatnonzero((off < -0.1 * size) & (run.dt > 0.0))
+        ends = ends[(np.abs(ends - last) <= reach + JUMP_REACH) & (ends > first)]
+        last = int(ends[-1]) if len(ends) else last
+        out[first : last + 1] = True
+    return out, jump
 
 
 # ------------------------------------------------------------------------------- the tracks
@@ -402,6 +413,7 @@ def _noise_claim(case: Case, sentence: str, bound: float) -> Claim:
     rows = np.isfinite(nis)
     return Claim(
         rows=rows,
+        whole=True,
         worst=int(np.argmin(np.abs(np.where(rows, nis, np.inf) - _median(nis)))),
         sentence=sentence,
         evidence=(
@@ -534,6 +546,7 @@ def _wrong_mounting(case: Case, bounds: Bounds) -> Claims:
     focal = run.camera.focal_px
     yield Claim(
         rows=_all(case) & (run.dt >= 0.0),
+        whole=True,
         worst=int(len(case.frame) - 1),
         sentence=f"the tracks spread from a point {abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px "
         f"{'below' if y > 0 else 'above'} of where the filter has its focus of expansion: a landmark {distance:.0f} px from "
@@ -573,6 +586,7 @@ def _odometer_scale(case: Case, bounds: Bounds) -> Claims:
     rows = np.asarray(np.isfinite(error).any(axis=1))
     yield Claim(
         rows=rows,
+        whole=True,
         worst=int(np.flatnonzero(rows)[-1]),
         sentence=f"against the reference all {len(each)} landmarks are {100 * abs(scale):.1f} % too "
         f"{'far' if scale > 0 else 'near'}, alike to {100 * alike:.1f} %: the odometer tells "
@@ -662,16 +676,17 @@ def _near_focus(case: Case, bounds: Bounds) -> Claims:
     for number in np.unique(ids[np.isfinite(ids)]).tolist():
         mine = (ids == number) & np.isfinite(distance) & driving[:, None]
         at = np.flatnonzero(mine.any(axis=1))
-        if len(at) < bounds["fewest"] or float(run.dt[at].sum()) < bounds["after_s"]:
-            continue
         slot = mine[at].argmax(axis=1)
-        near = distance[at, slot] < bounds["distance_px"]
+        late = np.cumsum(run.dt[at]) > bounds["after_s"]
         sigma = case["relative_sigma"][at, slot]
-        if near.mean() > bounds["share"] and sigma[-1] > bounds["relative_sigma"]:
+        others = np.array([_median(np.delete(case["relative_sigma"][k], j)) for k, j in zip(at, slot, strict=True)])
+        near = distance[at, slot] < bounds["distance_px"]
+        stuck = near & late & (sigma > bounds["relative_sigma"]) & (sigma > bounds["others"] * others)
+        if stuck.sum() >= bounds["fewest"]:
             concerned.append(number)
-            rows[at] = True
+            rows[at[stuck]] = True
             gain = np.linalg.norm(case["gain"][at, slot, 2, :], axis=1)
-            values.append((float(np.median(distance[at, slot])), float(sigma[-1]), _median(gain)))
+            values.append((float(np.median(distance[at, slot][stuck])), float(sigma[stuck][-1]), _median(gain)))
     if not concerned:
         return
     worst = int(np.flatnonzero(rows)[-1])
@@ -754,6 +769,8 @@ def _left(case: Case, rule: Rule) -> list[Claim]:
 
 def _without(claim: Claim, taken: Bools) -> Claim | None:
     """What remains of a claim: its stretches of frames that are not taken, each whole or not at all."""
+    if claim.whole:
+        return None if (claim.rows & taken).sum() >= EXPLAINED * claim.rows.sum() else claim
     rows = np.zeros(len(taken), bool)
     for first, last in spans_of(np.arange(len(taken)), claim.rows):
         stretch = slice(first, last + 1)
@@ -874,7 +891,7 @@ RULES: tuple[Rule, ...] = (
         "the principal point, or the camera's pitch or yaw in the vehicle, is not what the settings say",
         "set camera_pitch_rad and camera_yaw_rad (or camera_quat_xyzw), or centre_px, by the offset in the evidence; "
         "replay --calibrate measures the focus of expansion on a straight drive",
-        pair_s=5.0, sigmas=5.0, off_px=2.5,
+        pair_s=7.0, sigmas=4.0, off_px=2.5,
     ),
     _rule(
         "track-slip",
@@ -910,7 +927,7 @@ RULES: tuple[Rule, ...] = (
         "a landmark straight ahead does not move on the image while the vehicle comes nearer",
         "drive past it, or with turns; do not use its range before relative_sigma is below max_relative_sigma; "
         "mode = 'joint' helps a little",
-        distance_px=10.0, share=0.4, relative_sigma=0.1, after_s=3.0, fewest=20,
+        distance_px=10.0, relative_sigma=0.1, others=4.0, after_s=2.5, fewest=10,
     ),
     _rule(
         "odometer-scale",
