@@ -115,7 +115,7 @@ class Case:
 
     def rings(self, flag: Verdict) -> Bools:
         """The frames [n] at which an alarm rings."""
-        rings: Bools = (self.get("alarms") & int(flag)) != 0
+        rings: Bools = (self.get("alarms").astype(np.int64) & int(flag)) != 0
         return rings
 
     @classmethod

@@ -110,6 +110,11 @@ class Drive:
     shift: Floats
 
     @property
+    def in_plane(self) -> bool:
+        """Whether the records hold the whole motion: of `spatial` they have the turn and the speed ahead only."""
+        return self.settings.motion is not MotionModel.SPATIAL
+
+    @property
     def usual_dt(self) -> float:
         """The median interval between frames, s."""
         known = self.dt[self.dt > 0.0]
@@ -192,8 +197,7 @@ def _track_noise(case: Case) -> TrackNoise:
             continue
         ids = run.ids[k - 3 : k + 1]
         same = (ids == ids[0]).all(axis=0) & (ids[0] >= 0)
-        third = np.array([-1.0, 3.0, -3.0, 1.0]) @ run.pixel[k - 3 : k + 1].transpose(2, 1, 0)[..., ::-1].swapaxes(-1, -2)
-        third = third.T[same]
+        third = np.diff(run.pixel[k - 3 : k + 1], n=3, axis=0)[0][same]
         third = third[np.isfinite(third[:, 0])]
         if len(third) >= FEWEST:
             # the median takes away a share of the scatter, as a mean does: 1/n of the variance
@@ -237,7 +241,7 @@ def _steps(case: Case) -> Steps:
     for k in range(1, len(run.dt)):
         slots = run.shared(k - 1, k)
         slots = slots[np.isfinite(xi[k - 1, slots])]
-        if len(slots) < FEWEST or run.dt[k] <= 0.0:
+        if len(slots) < FEWEST or run.dt[k] <= 0.0 or not run.in_plane:
             continue
         before, now = run.pixel[k - 1, slots], run.pixel[k, slots]
         ahead = (run.turn[k] @ run.camera.rays(before).T).T
@@ -256,7 +260,7 @@ def _turned(camera: Camera, pixel: Floats) -> Floats:
 
 
 def _fitted(values: Floats, lever: Floats, sigma: float) -> tuple[float, float]:
-    """q of values ≈ lever · q and its σ, by Huber's weights that begin at the weighted median of the quotients."""
+    """The q of values ≈ lever · q and its σ, by Huber's weights that begin at the weighted median of the quotients."""
     known = np.isfinite(values) & np.isfinite(lever)
     values, lever = values[known], lever[known]
     total = float(lever @ lever)
@@ -305,7 +309,9 @@ def _pairs(case: Case, length_s: float, every_s: float) -> list[Pair]:
     run, noise = drive(case), track_noise(case)
     sigma = noise.shown_px if noise.points else noise.taken_px
     time = np.cumsum(run.dt)
-    found = []
+    found: list[Pair] = []
+    if not run.in_plane:
+        return found
     begins = np.unique(np.searchsorted(time, np.arange(0.0, time[-1] - length_s + 1e-6, every_s)))
     for first in begins.tolist():
         last = int(np.searchsorted(time, time[first] + length_s - 1e-6))
@@ -336,9 +342,9 @@ def _pair(run: Drive, first: int, last: int, sigma_px: float) -> Pair | None:
     by_turn = (now * (np.cross(shift, -np.cross(camera.axis, before)))).sum(axis=1)
     by_turn += 0.5 * (now * np.cross(-np.cross(camera.axis, shift), before)).sum(axis=1)
     way = shift[2] / camera.focal_px
-    by_focus = np.stack([(now * np.cross(way * axis, before)).sum(axis=1) for axis in np.eye(3)[:2]], axis=1)
+    aside = [(now * np.cross(way * axis, before)).sum(axis=1) for axis in np.eye(3)[:2]]
     time = float(run.dt[first + 1 : last + 1].sum())
-    return Pair(first, last, time, scale * off, scale * by_turn, scale[:, None] * by_focus)
+    return Pair(first, last, time, scale * off, scale * by_turn, scale[:, None] * np.stack(aside, axis=1))
 
 
 def turn_of(pair: Pair, sigma_omega: float) -> tuple[float, float]:
@@ -357,13 +363,14 @@ class Focus(NamedTuple):
     @property
     def significance(self) -> float:
         """Distance from 0 in σ (Mahalanobis)."""
-        return float(math.sqrt(max(self.off_px @ np.linalg.solve(self.covariance, self.off_px), 0.0)))
+        return math.sqrt(max(float(self.off_px @ np.linalg.solve(self.covariance, self.off_px)), 0.0))
 
 
 def focus_of(found: list[Pair], sigma_omega: float) -> Focus | None:
     """The one focus of expansion that all pairs have in common; the turn of each is free within the gyro's noise.
 
-    Least squares with Huber's weights, at last without blunders. Pairs overlap by half, so that the covariance is doubled.
+    Least squares with Huber's weights, at last without blunders. Pairs overlap by half, so that the covariance
+    is doubled.
     """
     if not found:
         return None
@@ -381,8 +388,8 @@ def focus_of(found: list[Pair], sigma_omega: float) -> Focus | None:
     a, b = a[known], b[known]
     prior = np.zeros((m, m + 2))
     prior[:, :m] = np.diag([1.0 / max(sigma_omega * math.sqrt(pair.seconds), 1e-6) for pair in found])
-    q = np.zeros(m + 2)
-    information = np.eye(m + 2)
+    q: Floats = np.zeros(m + 2)
+    information: Floats = np.eye(m + 2)
     for number in range(2 * ROUNDS):
         residual = b - a @ q
         w = _huber(residual)
@@ -391,8 +398,8 @@ def focus_of(found: list[Pair], sigma_omega: float) -> Focus | None:
         information = (a * w[:, None]).T @ a + prior.T @ prior
         if np.linalg.cond(information[m:, m:]) > 1e8:
             return None
-        q = np.linalg.solve(information, (a * w[:, None]).T @ b)
-    return Focus(q[m:], 2.0 * np.linalg.inv(information)[m:, m:], m)
+        q = np.asarray(np.linalg.solve(information, (a * w[:, None]).T @ b), dtype=np.float64)
+    return Focus(q[m:], np.asarray(2.0 * np.linalg.inv(information)[m:, m:], dtype=np.float64), m)
 
 
 def depth_at(run: Drive, slot: int, first: int, last: int, sigma_px: float) -> tuple[float, float]:
@@ -431,5 +438,5 @@ def blunders(case: Case, nis: float, quiet: float = QUIET_NIS) -> Bools:
 
 def updated(case: Case) -> Bools:
     """Which landmarks [n, N] had an innovation, whether it was used or not."""
-    outcome = case["outcome"]
-    return np.isin(outcome, [Outcome.UPDATED, Outcome.REJECTED, Outcome.RESET]) & np.isfinite(case["nis"])
+    innovated = np.isin(case["outcome"], [Outcome.UPDATED, Outcome.REJECTED, Outcome.RESET])
+    return np.asarray(innovated & np.isfinite(case["nis"]))

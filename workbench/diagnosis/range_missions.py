@@ -103,7 +103,9 @@ def straight(rng: Dice) -> Motion:
     return Drive(curve("line"), constant(rng.uniform(0.4, 0.6), DURATION_S))
 
 
-def weave(rng: Dice, *, turn_rad: tuple[float, float] = (0.04, 0.12), period_s: tuple[float, float] = (4.0, 8.0)) -> Motion:
+def weave(
+    rng: Dice, *, turn_rad: tuple[float, float] = (0.04, 0.12), period_s: tuple[float, float] = (4.0, 8.0)
+) -> Motion:
     """A drive along +x that swings to both sides."""
     speed = rng.uniform(0.4, 0.6)
     wave_m = speed * rng.uniform(*period_s)
@@ -135,7 +137,7 @@ def with_stop(rng: Dice, begin_s: float, length_s: float) -> Motion:
 
 def plan_of(rng: Dice, motion: Motion | None = None, **more: Any) -> Plan:
     """A mission without failures; what `more` names replaces its parts."""
-    usual = {
+    usual: dict[str, Any] = {
         "motion": motion or either(rng),
         "landmarks_m": landmarks(rng),
         "noise_px": float(rng.choice([0.2, 0.3, 0.5])),
@@ -238,7 +240,8 @@ def _wrong_mounting(rng: Dice) -> Plan:
     kind = rng.integers(3)
     if kind == 0:
         way = rng.choice([0.0, math.pi]) + rng.uniform(0.25, 0.75) * math.pi  # above or below rather than beside
-        return plan_of(rng, settings={"centre_px": (CENTRE_PX[0] + off * math.cos(way), CENTRE_PX[1] + off * math.sin(way))})
+        centre = (CENTRE_PX[0] + off * math.cos(way), CENTRE_PX[1] + off * math.sin(way))
+        return plan_of(rng, settings={"centre_px": centre})
     if kind == 2:  # a yaw looks much like a turn: it takes more to be told
         off = rng.uniform(12.0, 20.0)
     angle = float(rng.choice([-1.0, 1.0])) * off / FOCAL_PX
@@ -391,8 +394,7 @@ class Replayed:
 
 def replayed(name: str, seed: int, **settings: Any) -> Replayed:
     """Make and replay the mission of a failure and a seed; `settings` are changed besides."""
-    table = MISSIONS | OTHERS if name not in MISSIONS else MISSIONS
-    plan = table[name](rng_of(seed, name))
+    plan = {**MISSIONS, **OTHERS}[name](rng_of(seed, name))
     plan = dataclasses.replace(plan, settings={**plan.settings, **settings})
     chosen = settings_of(plan)
     estimator = RangeFilter(chosen)

@@ -144,8 +144,8 @@ def _dropped_frames(case: Case, bounds: Bounds) -> Claims:
         yield Claim(
             rows=rows,
             worst=worst,
-            sentence=f"about {missing} frames are missing, the longest gap is {run.dt[worst]:.2f} s; the landmarks were "
-            "carried on by speed and rate of turn",
+            sentence=f"about {missing} frames are missing, the longest gap is {run.dt[worst]:.2f} s; the landmarks "
+            "were carried on by speed and rate of turn",
             evidence=(
                 Evidence(name="dt_s", value=run.dt[worst], unit="s", usual=run.usual_dt,
                          bound=bounds["gap_factor"] * run.usual_dt),
@@ -166,14 +166,20 @@ def _missing_inputs(case: Case, bounds: Bounds) -> Claims:
     which = [words[k] for k in ages if old[k].any()]
     worst = int(np.nanargmax(np.where(rows, np.fmax(*ages.values()), -1.0)))
     before = int(np.flatnonzero(missing)[-1]) + 1 if missing.any() else 0
-    first = f"the first {before} frames have no speed or no rate of turn: no landmark could start" if before else ""
-    held = f"{' and '.join(which)} came no more for up to {max(float(np.nanmax(ages[k])) for k in ages if old[k].any()):.2f} s; the last one was held" if which else ""  # noqa: E501
+    first = (
+        f"before the frame in row {before} there is no speed or no rate of turn: no landmark could start"
+        if before
+        else ""
+    )
+    longest = max((float(np.nanmax(ages[k])) for k in ages if old[k].any()), default=0.0)
+    held = f"no {' and no '.join(which)} came for up to {longest:.2f} s; the last one was held" if which else ""
     yield Claim(
         rows=rows,
         worst=worst,
         sentence="; ".join(filter(None, (first, held))),
         evidence=tuple(
-            Evidence(name=k, value=float(ages[k][worst]), unit="s", usual=_median(ages[k]), bound=limit[k]) for k in ages
+            Evidence(name=name, value=float(age[worst]), unit="s", usual=_median(age), bound=limit[name])
+            for name, age in ages.items()
         ),
     )
 
@@ -194,13 +200,15 @@ def _swapped_stamps(case: Case, bounds: Bounds) -> Claims:
     if not rows.any():
         return
     worst = int(np.argmin(np.where(rows, np.nan_to_num(found.ratio, nan=1.0), 9.0)))
-    words = f"from frame to frame the image goes back and then too far by turns in {int(turns[rows].sum())} frames: " \
-            f"its step is {found.ratio[worst]:+.1f} times the one that the vehicle made" if turns.any() else ""  # fmt: skip
+    words = (
+        f"from frame to frame the image goes back and then too far by turns in {int(turns[rows].sum())} frames: its "
+        f"step is {found.ratio[worst]:+.1f} times the one that the vehicle made"
+    )
     skipped = f"{int(backwards.sum())} frames have a stamp that is not after the one before and were passed over"
     yield Claim(
         rows=rows | (_grown(rows, 2) & telling & (back | far)),
         worst=worst,
-        sentence="; ".join(filter(None, (words, skipped if backwards.any() else ""))),
+        sentence="; ".join(filter(None, (words if turns[rows].any() else "", skipped if backwards.any() else ""))),
         evidence=(
             Evidence(name="step on the image over the predicted one", value=float(found.ratio[worst]),
                      usual=_median(found.ratio[telling]), bound=bounds["back"]),
@@ -221,12 +229,12 @@ def _late_images(case: Case, bounds: Bounds) -> Claims:
     noise = np.hypot(found.turn_sigma_rad, run.settings.sigma_omega * np.sqrt(run.dt))
     delay, sigma = np.full((2, len(omega)), np.nan)
     for k in range(len(omega)):
-        rows = np.arange(max(0, k - half), min(len(omega), k + half + 1))
-        rows = rows[np.isfinite(found.turn_rad[rows])]
-        if len(rows) < half:
+        near = np.arange(max(0, k - half), min(len(omega), k + half + 1))
+        near = near[np.isfinite(found.turn_rad[near])]
+        if len(near) < half:
             continue
-        turn = found.turn_rad[rows]
-        kept = rows[np.abs(turn - np.median(turn)) <= 4.0 * max(looks.spread(turn), float(np.median(noise[rows])))]
+        turn = found.turn_rad[near]
+        kept = near[np.abs(turn - np.median(turn)) <= 4.0 * max(looks.spread(turn), float(np.median(noise[near])))]
         swing = change[kept] - change[kept].mean()  # a bias of the gyro is no delay
         total = float(swing @ swing)
         if total > 0.0:
@@ -247,7 +255,8 @@ def _late_images(case: Case, bounds: Bounds) -> Claims:
         rows=rows,
         worst=worst,
         sentence=f"the images turn {1e3 * abs(late):.0f} ms {'after' if late > 0 else 'before'} the gyro: their stamps "
-        f"are {'late' if late > 0 else 'early'} by that or more{jumps}; while turning at {DEG * np.abs(omega[rows]).max():.0f} °/s "
+        f"are {'late' if late > 0 else 'early'} by that or more{jumps}; while turning at "
+        f"{DEG * np.abs(omega[rows]).max():.0f} °/s "
         f"this moves the landmarks by up to {abs(late) * np.abs(omega[rows]).max() * run.camera.focal_px:.0f} px",
         evidence=(
             Evidence(name="delay of the images' stamps", value=float(delay[worst]), unit="s",
@@ -285,52 +294,53 @@ def _to_jumps(run: looks.Drive, rows: Bools, late_s: float, reach: int) -> tuple
 
 def _track_slip(case: Case, bounds: Bounds) -> Claims:
     """The same landmark is off by the same vector several times in a row, all of a sudden."""
-    seen, innovation = looks.updated(case), case["innovation_px"]
-    gate = looks.drive(case).settings.gate
-    limit = bounds["nis"] if gate == "off" else max(float(gate), bounds["nis"])
-    quiet = looks.median_nis(case) < bounds["others_nis"]
-    off = seen & (case["nis"] > limit) & quiet[:, None]
-    ids = case["landmark_id"]
-    rows_of: dict[int, list[int]] = {}
-    shift_of: dict[int, float] = {}
-    few, noise_px = int(bounds["in_a_row"]), looks.track_noise(case).shown_px
+    nis, ids = case["nis"], case["landmark_id"]
+    slips: dict[int, list[int]] = {}
+    size: dict[int, float] = {}
     for slot in range(ids.shape[1]):
-        where = np.flatnonzero(seen[:, slot])
-        for a in range(len(where) - few + 1):
-            rows = where[a : a + few]
-            if not off[rows, slot].all() or len(set(ids[rows, slot])) > 1:
-                continue
-            vectors = innovation[rows, slot]
-            mean = vectors.mean(axis=0)
-            size = float(np.linalg.norm(mean))
-            if (case["outcome"][where[max(0, a - 2) : a], slot] == Outcome.RESET).any():
-                continue  # back from where blunders in a row had led it
-            alike = np.abs(vectors - mean).max() < max(bounds["alike"] * size, bounds["alike_noise"] * noise_px)
-            before = float(np.linalg.norm(innovation[where[a - 1], slot])) if a else math.inf
-            if alike and before < bounds["before"] * size:
-                number = int(ids[rows[0], slot])
-                rows_of.setdefault(number, []).extend(range(int(rows[0]), int(rows[-1]) + 1))
-                shift_of[number] = max(shift_of.get(number, 0.0), size)
-    for number, found in rows_of.items():
+        for found, off_px in _jumps(case, slot, bounds):
+            number = int(ids[found[0], slot])
+            slips.setdefault(number, []).extend(range(int(found[0]), int(found[-1]) + 1))
+            size[number] = max(size.get(number, 0.0), off_px)
+    for number, off in slips.items():
         rows = np.zeros(len(case.frame), bool)
-        rows[found] = True
-        worst, slot = found[0], int(np.flatnonzero(ids[found[0]] == number)[0])
+        rows[off] = True
+        worst, slot = off[0], int(np.flatnonzero(ids[off[0]] == number)[0])
         again = bool((case["outcome"][rows, slot] == Outcome.RESET).any())
         yield Claim(
             rows=rows,
             worst=worst,
-            sentence=f"the track of landmark {number} jumped by {shift_of[number]:.1f} px and stayed there, while the "
+            sentence=f"the track of landmark {number} jumped by {size[number]:.1f} px and stayed there, while the "
             f"other landmarks moved as expected: it follows another point now; its range was "
             f"{'started anew' if again else 'kept'}",
             evidence=(
-                Evidence(name=f"nis of landmark {number}", value=float(case["nis"][worst, slot]),
-                         usual=_median(case["nis"][:, slot]), bound=limit),
+                Evidence(name=f"nis of landmark {number}", value=float(nis[worst, slot]), usual=_median(nis[:, slot]),
+                         bound=bounds["nis"]),
                 Evidence(name="median NIS of the frame", value=float(looks.median_nis(case)[worst]),
                          usual=_median(looks.median_nis(case)), bound=bounds["others_nis"]),
-                Evidence(name="innovation_px", value=shift_of[number], unit="px",
-                         usual=_median(np.linalg.norm(innovation[:, slot], axis=1))),
+                Evidence(name="innovation_px", value=size[number], unit="px",
+                         usual=_median(np.linalg.norm(case["innovation_px"][:, slot], axis=1))),
             ),
         )  # fmt: skip
+
+
+def _jumps(case: Case, slot: int, bounds: Bounds) -> Iterator[tuple[Ints, float]]:
+    """Rows in which the landmark of a slot is off by one vector, suddenly and alone, and the vector's length, px."""
+    off = looks.blunders(case, bounds["nis"], bounds["others_nis"])[:, slot]
+    seen = np.flatnonzero(looks.updated(case)[:, slot])
+    innovation, outcome = case["innovation_px"][:, slot], case["outcome"][:, slot]
+    few, noise_px = int(bounds["in_a_row"]), looks.track_noise(case).shown_px
+    for k in range(1, len(seen) - few + 1):
+        rows, before = seen[k : k + few], seen[max(0, k - 2) : k]
+        if not off[rows].all() or len(set(case["landmark_id"][rows, slot].tolist())) > 1:
+            continue
+        mean = innovation[rows].mean(axis=0)
+        size = float(np.linalg.norm(mean))
+        alike = np.abs(innovation[rows] - mean).max() < max(bounds["alike"] * size, bounds["alike_noise"] * noise_px)
+        sudden = float(np.linalg.norm(innovation[before[-1]])) < bounds["before"] * size
+        # after a reset it may come back from where blunders in a row had led it
+        if alike and sudden and not (outcome[before] == Outcome.RESET).any():
+            yield rows, size
 
 
 def _track_outliers(case: Case, bounds: Bounds) -> Claims:
@@ -373,7 +383,7 @@ def _overconfident_start(case: Case, bounds: Bounds) -> Claims:
     for first, slot in np.argwhere(outcome == Outcome.STARTED).tolist():
         same = np.flatnonzero((ids[:, slot] == ids[first, slot]) & np.isfinite(run.pixel[:, slot, 0]))
         same = same[(same > first) & (time[same] <= time[first] + bounds["views_s"])]
-        if not len(same):
+        if not len(same) or not run.in_plane:
             continue
         told, sigma = looks.depth_at(run, slot, first, int(same[-1]), sigma_px)
         begun, trusted = case["mean"][first, slot, 2], math.sqrt(case["covariance"][first, slot, 2, 2])
@@ -471,7 +481,8 @@ def _input_noise_too_small(case: Case, bounds: Bounds) -> Claims:
         sentence=f"from frame to frame all landmarks jump aside together as by a rate of turn that is noisy by "
         f"{shown:.2g} rad/s/√Hz, the filter takes {run.settings.sigma_omega:.2g}: its uncertainties are too small",
         evidence=(
-            Evidence(name="change of the image's turn less the gyro's, in σ", value=float(off[worst]), usual=looks.spread(off),
+            Evidence(name="change of the image's turn less the gyro's, in σ", value=float(off[worst]),
+                     usual=looks.spread(off),
                      bound=bounds["ratio"]),
             Evidence(name="gyro's noise that the image shows", value=shown, unit="rad/s/√Hz",
                      usual=run.settings.sigma_omega),
@@ -519,8 +530,9 @@ def _gyro_bias(case: Case, bounds: Bounds) -> Claims:
     yield Claim(
         rows=rows,
         worst=worst,
-        sentence=f"the gyro tells {DEG * abs(bias):.2f} °/s more to the {'right' if bias > 0 else 'left'} than the image "
-        f"turns, for {_seconds(case, rows):.0f} s{words}; landmarks level with the focus of expansion suffer most",
+        sentence=f"the gyro tells {DEG * abs(bias):.2f} °/s more to the {'right' if bias > 0 else 'left'} than "
+        f"the image turns, for {_seconds(case, rows):.0f} s{words}; landmarks level with the focus of expansion suffer "
+        "most",
         evidence=tuple(evidence),
     )
 
@@ -548,9 +560,10 @@ def _wrong_mounting(case: Case, bounds: Bounds) -> Claims:
         rows=_all(case) & (run.dt >= 0.0),
         whole=True,
         worst=int(len(case.frame) - 1),
-        sentence=f"the tracks spread from a point {abs(x):.1f} px to the {'right' if x > 0 else 'left'} and {abs(y):.1f} px "
-        f"{'below' if y > 0 else 'above'} of where the filter has its focus of expansion: a landmark {distance:.0f} px from "
-        f"it is off by about {100 * size / distance:.0f} %, those on the other side by as much the other way",
+        sentence=f"the tracks spread from a point {abs(x):.1f} px to the {'right' if x > 0 else 'left'} and "
+        f"{abs(y):.1f} px {'below' if y > 0 else 'above'} of where the filter has its focus of expansion: a landmark "
+        f"{distance:.0f} px from it is off by about {100 * size / distance:.0f} %, those on the other side by as much "
+        "the other way",
         evidence=(
             Evidence(name="focus of expansion off to the right", value=x, unit="px",
                      usual=0.0, bound=bounds["sigmas"] * math.sqrt(found.covariance[0, 0])),
@@ -614,7 +627,8 @@ def _standstill(case: Case, bounds: Bounds) -> Claims:
     length = np.where(time[last] > time[first], time[last] - time[first], np.nan)
     mean = np.abs(way[last] - way[first]) / length
     limit = np.fmin(bounds["speed_mps"], bounds["sigmas"] * run.settings.sigma_speed / np.sqrt(length) + 1e-3)
-    rows = _runs((case["still"] == 1) | (mean < limit), half)
+    # of a motion in space the record has the speed ahead only: there the filter's own word counts
+    rows = _runs((case["still"] == 1) | ((mean < limit) & run.in_plane), half)
     if not rows.any():
         return
     worst = int(np.flatnonzero(rows)[rows.sum() // 2])
@@ -625,7 +639,8 @@ def _standstill(case: Case, bounds: Bounds) -> Claims:
         sentence=f"the vehicle stands for {_seconds(case, rows):.1f} s: no range gets better; in {held} of "
         f"{int(rows.sum())} frames the filter took the speed for 0",
         evidence=(
-            Evidence(name="mean speed", value=float(mean[worst]), unit="m/s", usual=_median(mean), bound=float(limit[worst])),
+            Evidence(name="mean speed", value=float(mean[worst]), unit="m/s", usual=_median(mean),
+                     bound=float(limit[worst])),
             Evidence(name="relative_sigma", value=_median(case["relative_sigma"][worst]),
                      usual=_median(case["relative_sigma"])),
         ),
@@ -639,7 +654,7 @@ def _pure_rotation(case: Case, bounds: Bounds) -> Claims:
     distance = _median(case["range_m"][case["status"] == Status.CONVERGED])
     distance = distance if math.isfinite(distance) else 1.0 / _median(case["mean"][..., 2])
     by_way = np.abs(np.nan_to_num(case["speed_mps"])) / distance  # parallax and turn as angles a second
-    turning = (omega > bounds["turn_radps"]) & (by_way < bounds["way_share"] * omega)
+    turning = run.in_plane & (omega > bounds["turn_radps"]) & (by_way < bounds["way_share"] * omega)
     rows = _runs(turning, int(bounds["fewest"]))
     if not rows.any():
         return
@@ -656,7 +671,8 @@ def _pure_rotation(case: Case, bounds: Bounds) -> Claims:
         f"{run.settings.min_parallax_px:.0f} px",
         evidence=(
             Evidence(name="omega_radps", value=float(case["omega_radps"][worst]), unit="rad/s", usual=_median(omega)),
-            Evidence(name="speed_mps", value=float(case["speed_mps"][worst]), unit="m/s", usual=_median(case["speed_mps"])),
+            Evidence(name="speed_mps", value=float(case["speed_mps"][worst]), unit="m/s",
+                     usual=_median(case["speed_mps"])),
             Evidence(name="parallax_px", value=_median(raw[worst]), unit="px"),
             Evidence(name="derotated_parallax_px", value=_median(np.where(young, derotated, np.nan)[worst]), unit="px",
                      bound=run.settings.min_parallax_px),
@@ -733,8 +749,14 @@ DETECTORS: Mapping[str, Detect] = {
 }
 
 _STAMPS = ("dropped-motion", "missing-inputs", "swapped-stamps", "late-images")
-_COMMON = (*_STAMPS, "input-noise-too-small", "overconfident-start", "measurement-noise-too-small", "gyro-bias",
-           "wrong-mounting")
+_COMMON = (
+    *_STAMPS,
+    "input-noise-too-small",
+    "overconfident-start",
+    "measurement-noise-too-small",
+    "gyro-bias",
+    "wrong-mounting",
+)
 CAUSES: Mapping[str, tuple[str, ...]] = {
     "missing-inputs": ("dropped-motion",),
     "dropped-frames": ("dropped-motion", "late-images"),
@@ -821,8 +843,8 @@ RULES: tuple[Rule, ...] = (
         "missing-inputs",
         Severity.WARNING,
         "messages of the gyro or the odometer were lost, or begin later than the images",
-        "record the stream without losses; gyro = 'odometry' takes the rate of turn from the wheels where the IMU fails; "
-        "input_stale_s says from which age on the filter warns",
+        "record the stream without losses; gyro = 'odometry' takes the rate of turn from the wheels where the IMU "
+        "fails; input_stale_s says from which age on the filter warns",
         age_intervals=1.5,
     ),
     _rule(
