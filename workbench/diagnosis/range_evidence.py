@@ -36,6 +36,8 @@ AGE_INTERVALS = 1.5
 """Intervals between frames beyond which the age of an input, above its usual one, means that messages are missing."""
 FEWEST_INPUTS = 0.5
 """Share of the usual messages of the inputs below which some are missing."""
+WAY_SIGMAS = 5.0
+"""Shorter ways, in σ of the odometer's noise, have no direction for the geometry of pairs."""
 REGULAR = 0.25
 """Intervals that differ more from the usual one are left out of third differences."""
 BLUNDER = 6.0
@@ -329,7 +331,8 @@ def _pair(run: Drive, first: int, last: int, sigma_px: float) -> Pair | None:
     if run.blind[first + 1 : last + 1].any():
         return None
     turn, shift = run.between(first, last)
-    if len(slots) < FEWEST or not np.linalg.norm(shift) > 0.0:
+    seconds = float(run.dt[first + 1 : last + 1].sum())
+    if len(slots) < FEWEST or np.linalg.norm(shift) <= WAY_SIGMAS * run.settings.sigma_speed * math.sqrt(seconds):
         return None
     camera = run.camera
     before = (turn @ camera.rays(run.pixel[first, slots]).T).T
@@ -343,8 +346,7 @@ def _pair(run: Drive, first: int, last: int, sigma_px: float) -> Pair | None:
     by_turn += 0.5 * (now * np.cross(-np.cross(camera.axis, shift), before)).sum(axis=1)
     way = shift[2] / camera.focal_px
     aside = [(now * np.cross(way * axis, before)).sum(axis=1) for axis in np.eye(3)[:2]]
-    time = float(run.dt[first + 1 : last + 1].sum())
-    return Pair(first, last, time, scale * off, scale * by_turn, scale[:, None] * np.stack(aside, axis=1))
+    return Pair(first, last, seconds, scale * off, scale * by_turn, scale[:, None] * np.stack(aside, axis=1))
 
 
 def turn_of(pair: Pair, sigma_omega: float) -> tuple[float, float]:

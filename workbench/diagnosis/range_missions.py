@@ -19,7 +19,6 @@ from pipelines.lens import pinhole
 from pipelines.ranging.landmarks.settings import TrackSettings
 from pipelines.ranging.range_filter import RangeFilter
 from pipelines.ranging.range_settings import RangeSettings, StartKind
-from pipelines.ranging.reference import of_truth
 from pipelines.ranging.step import RangeStep
 from pipelines.simulation import faults as flaws
 from pipelines.simulation.channels import Channel, rng_of
@@ -420,9 +419,9 @@ def replayed(name: str, seed: int, **settings: Any) -> Replayed:
 
 def _depths(plan: Plan, steps: Sequence[RangeStep], t_s: Floats) -> Floats:
     """True depths of the landmarks in the slots of each frame [n, N]."""
-    depths = np.full((len(steps), len(steps[0].landmark_id)), np.nan)
-    for row, (step, t) in enumerate(zip(steps, t_s.tolist(), strict=True)):
-        known = np.isfinite(step.landmark_id)
-        places = plan.landmarks_m[step.landmark_id[known].astype(np.int64)]
-        depths[row, known] = of_truth(plan.motion, MOUNT, places, t).depth_m
-    return depths
+    turn, place = MOUNT.world_t_camera(plan.motion.at(t_s))
+    every = np.einsum("kni,ki->kn", plan.landmarks_m - place[:, None], turn[:, :, 2])
+    ids = np.array([step.landmark_id for step in steps])
+    known = np.isfinite(ids)
+    slots = np.where(known, ids, 0.0).astype(np.int64)
+    return np.where(known, np.take_along_axis(every, slots, axis=1), np.nan)

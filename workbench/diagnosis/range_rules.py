@@ -159,18 +159,15 @@ def _missing_inputs(case: Case, bounds: Bounds) -> Claims:
     limit = {k: bounds["age_intervals"] * run.usual_dt + _median(v) for k, v in ages.items()}
     old = {k: np.asarray(ages[k] > limit[k]) for k in ages}
     missing = case.rings(Verdict.INPUT_MISSING)
+    oldest = np.nan_to_num(np.fmax(*ages.values()))
     rows = old["gyro_age_s"] | old["odometer_age_s"] | missing
     if not rows.any():
         return
     words = {"gyro_age_s": "rate of turn", "odometer_age_s": "speed"}
     which = [words[k] for k in ages if old[k].any()]
-    worst = int(np.nanargmax(np.where(rows, np.fmax(*ages.values()), -1.0)))
-    before = int(np.flatnonzero(missing)[-1]) + 1 if missing.any() else 0
-    first = (
-        f"before the frame in row {before} there is no speed or no rate of turn: no landmark could start"
-        if before
-        else ""
-    )
+    worst = int(np.argmax(np.where(rows, oldest, -1.0)))
+    last = int(case.frame[missing][-1]) if missing.any() else -1
+    first = f"up to frame {last} there is no speed or no rate of turn: no landmark can start" if last >= 0 else ""
     longest = max((float(np.nanmax(ages[k])) for k in ages if old[k].any()), default=0.0)
     held = f"no {' and no '.join(which)} came for up to {longest:.2f} s; the last one was held" if which else ""
     yield Claim(
@@ -297,11 +294,15 @@ def _track_slip(case: Case, bounds: Bounds) -> Claims:
     nis, ids = case["nis"], case["landmark_id"]
     slips: dict[int, list[int]] = {}
     size: dict[int, float] = {}
+    blunder = looks.blunders(case, bounds["nis"], bounds["others_nis"])
     for slot in range(ids.shape[1]):
         for found, off_px in _jumps(case, slot, bounds):
-            number = int(ids[found[0], slot])
+            number, length = int(ids[found[0], slot]), float(np.linalg.norm(off_px))
             slips.setdefault(number, []).extend(range(int(found[0]), int(found[-1]) + 1))
-            size[number] = max(size.get(number, 0.0), off_px)
+            size[number] = max(size.get(number, 0.0), length)
+            later = blunder[:, slot] & (ids[:, slot] == number) & (np.arange(len(ids)) > found[-1])
+            back = np.linalg.norm(case["innovation_px"][:, slot] + off_px, axis=1) < bounds["back"] * length
+            slips[number] += np.flatnonzero(later & back).tolist()
     for number, off in slips.items():
         rows = np.zeros(len(case.frame), bool)
         rows[off] = True
@@ -324,8 +325,8 @@ def _track_slip(case: Case, bounds: Bounds) -> Claims:
         )  # fmt: skip
 
 
-def _jumps(case: Case, slot: int, bounds: Bounds) -> Iterator[tuple[Ints, float]]:
-    """Rows in which the landmark of a slot is off by one vector, suddenly and alone, and the vector's length, px."""
+def _jumps(case: Case, slot: int, bounds: Bounds) -> Iterator[tuple[Ints, Floats]]:
+    """Rows in which the landmark of a slot is off by one vector, suddenly and alone, and the vector [2], px."""
     off = looks.blunders(case, bounds["nis"], bounds["others_nis"])[:, slot]
     seen = np.flatnonzero(looks.updated(case)[:, slot])
     innovation, outcome = case["innovation_px"][:, slot], case["outcome"][:, slot]
@@ -340,7 +341,7 @@ def _jumps(case: Case, slot: int, bounds: Bounds) -> Iterator[tuple[Ints, float]
         sudden = float(np.linalg.norm(innovation[before[-1]])) < bounds["before"] * size
         # after a reset it may come back from where blunders in a row had led it
         if alike and sudden and not (outcome[before] == Outcome.RESET).any():
-            yield rows, size
+            yield rows, mean
 
 
 def _track_outliers(case: Case, bounds: Bounds) -> Claims:
@@ -762,7 +763,7 @@ CAUSES: Mapping[str, tuple[str, ...]] = {
     "dropped-frames": ("dropped-motion", "late-images"),
     "late-images": ("dropped-motion", "missing-inputs", "swapped-stamps"),
     "input-noise-too-small": _STAMPS,
-    "gyro-bias": (*_STAMPS, "input-noise-too-small"),
+    "gyro-bias": (*_STAMPS, "input-noise-too-small", "pure-rotation"),
     "wrong-mounting": (*_STAMPS, "input-noise-too-small", "gyro-bias"),
     "track-slip": _COMMON,
     "track-outliers": (*_COMMON, "track-slip"),
@@ -920,7 +921,7 @@ RULES: tuple[Rule, ...] = (
         Severity.WARNING,
         "the tracker went over to another point: an edge in front of another, a repeated pattern",
         "reset_after = 3 starts the range anew (0 never does); check tracks forwards and backwards in the tracker",
-        nis=25.0, others_nis=6.0, in_a_row=3, alike=0.1, alike_noise=5.0, before=0.4,
+        nis=25.0, others_nis=6.0, in_a_row=3, alike=0.1, alike_noise=5.0, before=0.4, back=0.5,
     ),
     _rule(
         "track-outliers",

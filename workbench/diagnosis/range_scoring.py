@@ -119,8 +119,8 @@ def page(scores: Sequence[Score], seeds: Sequence[int], mode: str) -> str:
         f"Made by `python -m workbench.diagnosis.range_scoring --seeds {len(seeds)} --first {seeds[0]}"
         + ("" if mode == "independent" else f" --mode {mode}")
         + "`; do not edit.",
-        f"{len(seeds)} missions each, seeds {seeds[0]}-{seeds[-1]}; mode `{mode}`. What is planted, and what recall and",
-        "precision are, is in [diagnosis-range.md](diagnosis-range.md#scores).",
+        f"{len(seeds)} missions each, seeds {seeds[0]}-{seeds[-1]}; mode `{mode}`. What is planted, and what recall",
+        "and precision are, is in [diagnosis-range.md](diagnosis-range.md#scores).",
         "",
         "| planted | recall | precision | findings elsewhere |",
         "|---|---|---|---|",
