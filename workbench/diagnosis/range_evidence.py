@@ -38,6 +38,8 @@ FEWEST_INPUTS = 0.5
 """Share of the usual messages of the inputs below which some are missing."""
 WAY_SIGMAS = 5.0
 """Shorter ways, in σ of the odometer's noise, have no direction for the geometry of pairs."""
+SLIPPED = 3
+"""Blunders between two frames from which on a track may have slipped to another point."""
 REGULAR = 0.25
 """Intervals that differ more from the usual one are left out of third differences."""
 BLUNDER = 6.0
@@ -328,6 +330,7 @@ def _pair(run: Drive, first: int, last: int, sigma_px: float) -> Pair | None:
     """r₂ᵀ [t]ₓ R r₁ = 0 for each landmark, linearised in a turn and in the direction of the way."""
     slots = run.shared(first, last)
     slots = slots[~(run.blunder[first, slots] | run.blunder[last, slots])]
+    slots = slots[run.blunder[first : last + 1, slots].sum(axis=0) < SLIPPED]  # the others may show two points
     if run.blind[first + 1 : last + 1].any():
         return None
     turn, shift = run.between(first, last)
