@@ -285,6 +285,17 @@ class Run:
             return None
         return Trajectory.of(self.t_ns, self.column("pose"))
 
+    @functools.cached_property
+    def reference_depths(self) -> Floats | None:
+        """Reference depth of the landmark in each slot of every frame [n, N], m; None where nothing tells any."""
+        found = self._series(self.file, f"{self.root}/reference")
+        if found is None:
+            return None
+        depths = np.full((len(self.frames), found.values.shape[1]), np.nan)
+        _, here, there = np.intersect1d(self.frames, found.frame, assume_unique=True, return_indices=True)
+        depths[here] = found.values[there]
+        return depths
+
     def _series(self, file: Path, entity: str) -> Any:
         from workbench.rrd_reading import series
 

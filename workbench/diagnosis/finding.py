@@ -86,6 +86,8 @@ class Case:
         harm_m: what each frame adds to the end-point error [n], NaN where it is not known.
         facts: oddities of the recording's streams, a sentence each.
         get: the column [n, *shape] of a field by its name.
+        reference_depth_m: of the range estimator: reference depth of the landmark in each slot [n, N], NaN where it is
+            not known; None where no reference tells any.
         kept: what rules share, see `once`.
     """
 
@@ -97,13 +99,18 @@ class Case:
     harm_m: Floats
     facts: Sequence[str]
     get: Callable[[str], NDArray[Any]] = field(repr=False)
+    reference_depth_m: Floats | None = None
     kept: dict[Any, Any] = field(default_factory=dict, repr=False, compare=False)
 
-    def once(self, make: Callable[[Case], T]) -> T:
-        """What a function makes of this case, made only once however many rules ask for it."""
-        if make not in self.kept:
-            self.kept[make] = make(self)
-        kept: T = self.kept[make]
+    def once(self, make: Callable[[Case], T], key: Any = None) -> T:
+        """What a function makes of this case, made only once however many rules ask for it.
+
+        `key` stands for the function where it is made anew for every call.
+        """
+        name = make if key is None else key
+        if name not in self.kept:
+            self.kept[name] = make(self)
+        kept: T = self.kept[name]
         return kept
 
     def __getitem__(self, name: str) -> NDArray[Any]:
@@ -112,7 +119,7 @@ class Case:
 
     def rings(self, flag: Verdict) -> Bools:
         """The frames [n] at which an alarm rings."""
-        rings: Bools = (self.get("alarms") & int(flag)) != 0
+        rings: Bools = (self.get("alarms").astype(np.int64) & int(flag)) != 0
         return rings
 
     @classmethod
@@ -128,6 +135,7 @@ class Case:
             harm_m=np.full(len(run.frames), np.nan) if harm_m is None else harm_m,
             facts=tuple(run.summary.get("facts", ())),
             get=run.column,
+            reference_depth_m=run.reference_depths,
         )
 
     @classmethod
@@ -138,6 +146,7 @@ class Case:
         settings: Mapping[str, Any],
         reference: Trajectory | None = None,
         facts: Sequence[str] = (),
+        reference_depth_m: Floats | None = None,
     ) -> Self:
         """The case of steps in memory."""
         t_ns = np.array([step.t_ns for step in steps], np.int64)
@@ -157,6 +166,7 @@ class Case:
             harm_m=np.full(len(steps), np.nan),
             facts=facts,
             get=get,
+            reference_depth_m=reference_depth_m,
         )
 
 
