@@ -211,6 +211,18 @@ def test_gate_rejects_and_the_third_rejection_resets() -> None:
     assert now.turn_rad[0] == 0
 
 
+def test_resets_one_after_the_other_do_not_ruin_the_covariance() -> None:
+    model = FilterSettings().model(F, CENTRE)
+    now, ahead, rng = one(), Inputs(0.01, 0.5, 0.1), np.random.default_rng(0)
+    outcomes = []
+    for _ in range(60):
+        now, update = rf.step(model, now, ahead, rng.uniform(100, 500, (1, 2)), 0.09)
+        outcomes.append(update.outcome[0])
+        assert np.linalg.eigvalsh(update.innovation_covariance[0]).min() > 0
+        assert now.covariance[0, 2, 2] > 0
+    assert outcomes.count(Outcome.RESET) > 3
+
+
 def test_an_accepted_point_or_none_between_breaks_or_keeps_the_row() -> None:
     model = FilterSettings().model(F, CENTRE)
     now, still = one(), Inputs(0.0, 0.0, 0.1)

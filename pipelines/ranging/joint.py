@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 from pipelines.ranging import equations as eq
 from pipelines.ranging.equations import Point
 from pipelines.ranging.filter import Inputs
-from pipelines.ranging.kernels import LOST, PREDICTED, REJECTED, RESET, UPDATED, linearised
+from pipelines.ranging.kernels import LOST, PREDICTED, REJECTED, RESET, UPDATED, linearised, widened
 from pipelines.ranging.settings import Model
 from pipelines.ranging.start import Start
 
@@ -273,7 +273,7 @@ def _update_all(
         if outcome[i] == REJECTED and rejections[i] == model.reset_after:
             outcome[i], rejections[i] = RESET, 0
             mean[i, 0], mean[i, 1] = pixel[i, 0], pixel[i, 1]
-            kept = covariance[at + 2, at + 2] * model.reset_factor
+            kept = widened(model, covariance[at + 2, at + 2])
             covariance[at : at + 3, :] = 0.0
             covariance[:, at : at + 3] = 0.0
             covariance[at, at] = covariance[at + 1, at + 1] = variance[i]

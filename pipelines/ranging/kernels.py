@@ -187,9 +187,15 @@ def advance(
         if rejections == model.reset_after:
             rejections, outcome = 0, RESET
             point = Point(u, v, point.xi)
-            after = Covariance(variance, 0.0, 0.0, variance, 0.0, ahead.kk * model.reset_factor)
+            after = Covariance(variance, 0.0, 0.0, variance, 0.0, widened(model, ahead.kk))
     point = Point(point.u, point.v, min(max(point.xi, model.xi_floor), model.xi_ceiling))
     return Advance(step.point, ahead, step.a, step.g, du, dv, nis, c, outcome, rejections, point, after)
+
+
+@_jit
+def widened(model: Model, variance: float) -> float:
+    """P_ξξ after a reset: at most the square of the largest ξ, beyond which P says nothing and loses its digits."""
+    return min(variance * model.reset_factor, model.xi_ceiling**2)
 
 
 @_jit

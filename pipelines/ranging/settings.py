@@ -82,7 +82,7 @@ class FilterSettings(BaseModel):
     noise_gain: GainForm = Field(GainForm.EXACT, description="how G is written (29)")
     gate: Positive | Literal["off"] = Field(13.8, description="an innovation of larger NIS is rejected; or off")
     reset_after: Annotated[int, Field(ge=0)] = Field(3, description="rejections in a row that reset; 0: never")
-    reset_factor: Positive = Field(100.0, description="a reset multiplies the variance of ξ")
+    reset_factor: Positive = Field(100.0, description="a reset multiplies the variance of ξ, up to 1/nearest_m²")
     xi_floor: Positive = Field(1e-3, description="ξ is not let below, 1/m; its variance is left as it is")
     nearest_m: Positive = Field(0.1, description="1/ξ is not let below, m, so that a wrong ξ does not end the track")
     relinearisations: Annotated[int, Field(ge=0, le=10)] = Field(

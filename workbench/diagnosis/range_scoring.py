@@ -1,174 +1,62 @@
-"""How well the rules of the range estimator tell planted failures: recall, precision, the confusion matrix.
+"""The range filter's table of planted failures, for `workbench.diagnosis.scoring`.
 
-    python -m workbench.diagnosis.range_scoring --seeds 20
-
-prints the matrix and writes docs/diagnosis-matrix-range.md. Same seeds, same text.
+What is called a preset there is the filter's mode here: ``best`` (which is ``independent``) or ``joint``.
 """
 
 from __future__ import annotations
 
-import argparse
-import math
-import sys
-from collections import Counter
-from collections.abc import Iterable, Mapping, Sequence
-from concurrent.futures import ProcessPoolExecutor
-from dataclasses import dataclass
+from collections.abc import Mapping
 from functools import partial
-from pathlib import Path
-from typing import NamedTuple
 
-from pipelines.verdict import Severity
-from workbench.diagnosis import diagnose, range_rules
-from workbench.diagnosis.range_missions import CLEAN, MISSIONS, OTHERS, replayed
+import numpy as np
 
-MARGIN = 2
-"""Frames beside those of a failure at which a finding still counts as at its frames."""
-PAGE = Path(__file__).parents[2] / "docs" / "diagnosis-matrix-range.md"
+from workbench.diagnosis.range_missions import CLEAN, MISSIONS, UNSEEN, replayed
+from workbench.diagnosis.scoring import Planted, Trial
 
+MODES: Mapping[str, str] = {"best": "independent", "joint": "joint"}
 
-class Told(NamedTuple):
-    """The names of the findings of one mission: at the failure's frames, elsewhere, and those of severity error."""
+STRENGTHS: Mapping[str, str] = {
+    CLEAN: "",
+    "near-focus": "within 2 px of the focus at the start",
+    "pure-rotation": "0.6…1 rad on the spot in 3…5 s, at the start or amidst",
+    "standstill": "2.5…5 s",
+    "overconfident-start": "0.3…0.45 or 2.5…4 times the median range, σ 2…6 % of it",
+    "measurement-noise-too-small": "σ of R 2.2…5 times too small",
+    "measurement-noise-too-large": "σ of R 2.2…5 times too large",
+    "input-noise-too-small": "gyro 6e-3…1.2e-2 rad/s/√Hz; told 5…20 times less, or 0",
+    "dropped-frames": "0.4…1.5 s",
+    "dropped-motion": "0.4…1.5 s, images and inputs",
+    "late-images": "40…200 ms for 5…8 s, headings swing by 0.1…0.18 rad in 3…5 s",
+    "swapped-stamps": "1…3 s",
+    "wrong-mounting": "principal point or pitch 6…15 px, yaw 12…20 px",
+    "gyro-bias": "0.006…0.02 rad/s, always or for 6…9 s",
+    "track-outliers": "5…30 % of the points by up to 25…60 px for 1…4 s",
+    "track-slip": "8…30 px for 3…6 s",
+    "missing-inputs": "gyro, odometer or both for 0.6…2 s",
+    "odometer-scale": "5…12 %, with reference depths",
+    UNSEEN: "5…12 %",
+}
 
-    at: tuple[str, ...]
-    elsewhere: tuple[str, ...]
-    errors: tuple[str, ...]
-
-
-@dataclass(frozen=True)
-class Score:
-    """What was told of the missions of one failure.
-
-    Attributes:
-        failure: its name, which is that of the right rule; one of `OTHERS` has none.
-        missions: one entry a seed.
-    """
-
-    failure: str
-    missions: tuple[Told, ...]
-
-    @property
-    def counts(self) -> Counter[str]:
-        """How many findings of each rule there are at the failure's frames."""
-        return Counter(name for told in self.missions for name in told.at)
-
-    @property
-    def elsewhere(self) -> Counter[str]:
-        """How many findings of each rule there are at other frames only."""
-        return Counter(name for told in self.missions for name in told.elsewhere)
-
-    @property
-    def recall(self) -> float:
-        """Share of the missions in which the right rule is among the findings at the failure's frames."""
-        return sum(self.failure in told.at for told in self.missions) / len(self.missions)
-
-    @property
-    def precision(self) -> float:
-        """Share of the findings at the failure's frames that are of the right rule; NaN where there are none."""
-        total = self.counts.total()
-        return self.counts[self.failure] / total if total else math.nan
-
-    @property
-    def errors(self) -> int:
-        """Findings of severity error, anywhere in the missions."""
-        return sum(len(told.errors) for told in self.missions)
+LEFT_OUT: Mapping[str, str] = {
+    "odometer-scale without a reference": "every range is off by the same share, and no number inside the filter knows",
+    "σ_V too small": "the errors of the speed are common to all landmarks: NIS does not show them",
+}
 
 
-def told_of(failure: str, seed: int, mode: str = "independent") -> Told:
-    """Make, replay and diagnose one mission."""
+def trial(failure: str, mode: str, seed: int) -> Trial:
+    """The mission of a failure and a seed, replayed."""
     made = replayed(failure, seed, mode=mode)
-    findings = diagnose(made.case, range_rules.RULES)
-    here = {id(f) for f in findings if any(f.covers(int(frame), MARGIN) for frame in made.wrong)}
-    return Told(
-        tuple(f.rule for f in findings if id(f) in here),
-        tuple(f.rule for f in findings if id(f) not in here),
-        tuple(f.rule for f in findings if f.severity is Severity.ERROR),
+    return Trial(made.case, np.isin(made.case.frame, made.wrong))
+
+
+def planted(preset: str = "best") -> tuple[Planted, ...]:
+    """The failures of the range filter, and the rules that have to name them."""
+    return tuple(
+        Planted(
+            fault=name,
+            rule=name if name in MISSIONS else "",
+            trial=partial(trial, name, MODES[preset]),
+            strength=strength,
+        )
+        for name, strength in STRENGTHS.items()
     )
-
-
-def scored(failures: Iterable[str], seeds: Sequence[int], *, mode: str = "independent", jobs: int = 1) -> list[Score]:
-    """The scores of some failures over some seeds; `jobs` processes share the missions."""
-    names = list(failures)
-    pairs = [(name, seed) for name in names for seed in seeds]
-    arguments = [name for name, _ in pairs], [seed for _, seed in pairs]
-    one = partial(told_of, mode=mode)
-    if jobs == 1:
-        told = list(map(one, *arguments))
-    else:
-        with ProcessPoolExecutor(jobs) as pool:
-            told = list(pool.map(one, *arguments, chunksize=4))
-    width = len(seeds)
-    return [Score(name, tuple(told[k * width : (k + 1) * width])) for k, name in enumerate(names)]
-
-
-# ------------------------------------------------------------------------------ as a page
-
-
-def _words(counts: Mapping[str, int]) -> str:
-    return ", ".join(f"{name} {counts[name]}" for name in sorted(counts)) or "–"
-
-
-def page(scores: Sequence[Score], seeds: Sequence[int], mode: str) -> str:
-    """The scores as a page of Markdown."""
-    rules = [rule.name for rule in range_rules.RULES]
-    planted = [score for score in scores if score.failure in MISSIONS]
-    others = [score for score in scores if score.failure not in MISSIONS]
-    lines = [
-        "# Failures of the range filter: planted and told",
-        "",
-        f"Made by `python -m workbench.diagnosis.range_scoring --seeds {len(seeds)} --first {seeds[0]}"
-        + ("" if mode == "independent" else f" --mode {mode}")
-        + "`; do not edit.",
-        f"{len(seeds)} missions each, seeds {seeds[0]}-{seeds[-1]}; mode `{mode}`. What is planted, and what recall",
-        "and precision are, is in [diagnosis-range.md](diagnosis-range.md#scores).",
-        "",
-        "| planted | recall | precision | findings elsewhere |",
-        "|---|---|---|---|",
-    ]
-    lines += [f"| {s.failure} | {s.recall:.2f} | {s.precision:.2f} | {_words(s.elsewhere)} |" for s in planted]
-    lines += ["", "| nothing to be found | findings of severity error | all findings |", "|---|---|---|"]
-    for s in others:
-        lines.append(f"| {s.failure} | {s.errors} | {_words(s.counts + s.elsewhere)} |")
-    lines += [
-        "",
-        "## Confusion matrix",
-        "",
-        "Findings at the frames of the planted failure, ±2; columns are the rules:",
-        "",
-    ]
-    lines.append(" · ".join(f"{k + 1} {name}" for k, name in enumerate(rules)))
-    lines += [
-        "",
-        "| planted | " + " | ".join(str(k + 1) for k in range(len(rules))) + " |",
-        "|---" * (len(rules) + 1) + "|",
-    ]
-    for s in sorted(planted, key=lambda s: rules.index(s.failure)):
-        cells = (str(s.counts[name] or "") for name in rules)
-        lines.append(f"| {rules.index(s.failure) + 1} {s.failure} | " + " | ".join(cells) + " |")
-    return "\n".join(lines) + "\n"
-
-
-def main(arguments: Sequence[str] | None = None) -> None:
-    """Score all failures; write the page and print it."""
-    parser = argparse.ArgumentParser(description="Score the rules of the range estimator on planted failures.")
-    parser.add_argument("--seeds", type=int, default=20, help="missions of each failure")
-    parser.add_argument("--first", type=int, default=0, help="first seed; the rules were tuned on 100 and above")
-    parser.add_argument("--mode", choices=("independent", "joint"), default="independent", help="of the filter")
-    parser.add_argument("--jobs", type=int, default=1, help="processes")
-    parser.add_argument("--only", nargs="*", choices=[*MISSIONS, *OTHERS], help="some failures; no page is written")
-    parser.add_argument("-o", "--out", type=Path, default=PAGE, help="the page")
-    given = parser.parse_args(arguments)
-    if given.seeds < 1 or given.first < 0 or given.jobs < 1:
-        parser.error("--seeds and --jobs are 1 or more, --first is 0 or more")
-    seeds = range(given.first, given.first + given.seeds)
-    found = scored(given.only or [*MISSIONS, *OTHERS], seeds, mode=given.mode, jobs=given.jobs)
-    text = page(found, seeds, given.mode)
-    if not given.only:
-        given.out.write_text(text, encoding="utf-8")
-    sys.stdout.write(text)
-
-
-__all__ = ["CLEAN", "MARGIN", "Score", "Told", "main", "page", "scored", "told_of"]
-
-if __name__ == "__main__":
-    main()

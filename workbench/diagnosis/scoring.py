@@ -10,9 +10,12 @@ from __future__ import annotations
 
 import argparse
 import importlib
+import multiprocessing
 import sys
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from concurrent.futures import ProcessPoolExecutor
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -42,7 +45,7 @@ class Planted:
 
     Attributes:
         fault: its name.
-        rule: the rule that is the right answer; "" for clean missions, in which nothing is to be found.
+        rule: the rule that is the right answer; "" for missions in which nothing grave is to be found.
         trial: makes the mission of a seed, of so and so many frames.
         strength: within what range the seeds vary it, for the table.
     """
@@ -87,6 +90,27 @@ def score(planted: Planted, seed: int) -> Scored:
         elsewhere=_names(finding for finding in found if finding not in here),
         errors=_names(finding for finding in found if finding.severity is Severity.ERROR),
     )
+
+
+def scores(estimator: str, preset: str, faults: Sequence[str], seeds: Sequence[int], jobs: int = 1) -> list[Scored]:
+    """Diagnose the trials of some faults over some seeds; `jobs` processes share them."""
+    pairs = [(fault, seed) for fault in faults for seed in seeds]
+    one = partial(_one, estimator, preset)
+    if jobs == 1:
+        return [one(pair) for pair in pairs]
+    with ProcessPoolExecutor(jobs, mp_context=multiprocessing.get_context("spawn")) as pool:
+        return list(pool.map(one, pairs, chunksize=2))
+
+
+def _one(estimator: str, preset: str, pair: tuple[str, int]) -> Scored:
+    fault, seed = pair
+    return score(next(one for one in table_of(estimator, preset) if one.fault == fault), seed)
+
+
+def table_of(estimator: str, preset: str) -> tuple[Planted, ...]:
+    """The faults of an estimator."""
+    found: tuple[Planted, ...] = importlib.import_module(TABLES[estimator]).planted(preset)
+    return found
 
 
 def touches(finding: Finding, trial: Trial) -> bool:
@@ -155,8 +179,8 @@ def failures(scored: Iterable[Scored]) -> list[str]:
     found = []
     for fault, trials in by_fault(scored).items():
         figures = Figures.of(trials)
-        if fault == CLEAN:
-            found += [f"{CLEAN}, seed {one.seed}: error {name}" for one in trials for name in one.errors]
+        if not trials[0].right:
+            found += [f"{fault}, seed {one.seed}: error {name}" for one in trials for name in one.errors]
         elif not (figures.recall >= BAR and figures.precision >= BAR):
             found.append(f"{fault}: recall {figures.recall:.2f}, precision {figures.precision:.2f}")
     return found
@@ -166,23 +190,23 @@ def failures(scored: Iterable[Scored]) -> list[str]:
 
 
 def to_markdown(
-    scored: Sequence[Scored], table: Sequence[Planted], left_out: Mapping[str, str], *, title: str, seeds: str
+    scored: Sequence[Scored], table: Sequence[Planted], left_out: Mapping[str, str], *, title: str, made: str
 ) -> str:
     """The page with the figures and the confusion matrix."""
     grouped = by_fault(scored)
     lines = [
         f"# {title}",
         "",
-        f"Made by `python -m workbench.diagnosis.scoring`, {seeds}; [diagnosis.md](diagnosis.md) says what is counted.",
+        f"Made by `python -m workbench.diagnosis.scoring {made}`; [diagnosis.md](diagnosis.md) says what is counted.",
         "",
         "| Fault | Strength | Right rule | Trials | Recall | Precision | Other rules at its frames | Elsewhere |",
         "|---|---|---|---|---|---|---|---|",
     ]
     lines += [_figures_row(planted, Figures.of(grouped[planted.fault])) for planted in table]
-    if CLEAN in grouped:
-        clean = grouped[CLEAN]
-        errors = sum(len(one.errors) for one in clean)
-        lines += ["", f'Findings of severity "error" in {len(clean)} clean missions: {errors}.']
+    for fault, trials in grouped.items():
+        if not trials[0].right:
+            errors = sum(len(one.errors) for one in trials)
+            lines += ["", f'Findings of severity "error" in {len(trials)} missions "{fault}": {errors}.']
     if left_out:
         lines += ["", "## Without a trace", "", "| Fault | Why it cannot be told |", "|---|---|"]
         lines += [f"| {fault} | {why} |" for fault, why in left_out.items()]
@@ -235,23 +259,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser.add_argument("--seeds", type=int, default=20, help="how many seeds a fault")
     parser.add_argument("--first-seed", type=int, default=0)
     parser.add_argument("--fault", action="append", help="only this fault; may be repeated")
+    parser.add_argument("--jobs", type=int, default=1, help="processes that share the trials")
     parser.add_argument(
         "-o", "--output", type=Path, help="Markdown file; docs/diagnosis-matrix-ESTIMATOR.md by default"
     )
     asked = parser.parse_args(arguments)
     module: Any = importlib.import_module(TABLES[asked.estimator])
-    table = [one for one in module.planted(asked.preset) if not asked.fault or one.fault in asked.fault]
+    table = [one for one in table_of(asked.estimator, asked.preset) if not asked.fault or one.fault in asked.fault]
     seeds = range(asked.first_seed, asked.first_seed + asked.seeds)
-    scored = [score(planted, seed) for planted in table for seed in seeds]
+    scored = scores(asked.estimator, asked.preset, [one.fault for one in table], seeds, asked.jobs)
     page = to_markdown(
         scored,
         table,
         module.LEFT_OUT,
         title=f"Diagnosis of `{asked.estimator}`, preset `{asked.preset}`: scored on planted faults",
-        seeds=f"seeds {seeds.start} to {seeds.stop - 1}",
+        made=f"--estimator {asked.estimator} --seeds {asked.seeds} --first-seed {asked.first_seed}",
     )
     default = Path(__file__).parents[2] / "docs" / f"diagnosis-matrix-{asked.estimator}.md"
-    (asked.output or default).write_text(page, encoding="utf-8")
+    if asked.output or not asked.fault:  # some faults only are no page of all
+        (asked.output or default).write_text(page, encoding="utf-8")
     missed = failures(scored)
     sys.stdout.write(page + "".join(f"misses the bar: {line}\n" for line in missed))
     return 1 if missed else 0
