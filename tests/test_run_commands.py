@@ -2,6 +2,7 @@
 
 import json
 import math
+import shutil
 from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
@@ -16,9 +17,10 @@ from readers.streams import RecordingError
 from workbench import rrd
 from workbench.check import CheckError, Expectation, check, parsed, read_expectations
 from workbench.compare import compare
-from workbench.diagnosis.finding import Evidence, Finding
+from workbench.diagnosis import diagnose
+from workbench.diagnosis.finding import Case, Evidence, Finding
 from workbench.explain import explain, scores, worst_frames
-from workbench.judgement import judged
+from workbench.judgement import budget_of, judged
 from workbench.metrics import MetricError, metric, metrics
 from workbench.runs import Run, open_run, runs_in
 from workbench.session import Request, run
@@ -99,22 +101,39 @@ def test_a_drifting_number_is_judged_by_its_change_and_a_steady_one_by_itself() 
     steps[200] = 0.2
     steady = rng.normal(5.0, 0.5, 400)
     steady[200] = 9.0
-    found = scores(np.column_stack([np.cumsum(steps), steady]), 200)
+    table, rows = np.column_stack([np.cumsum(steps), steady]), np.arange(1, 400)
+    found = scores(table, 200, rows)
     assert found.drifts.tolist() == [True, False]
     assert found.usual == pytest.approx([0.1, 5.0], rel=0.05)
     assert found.change[0] == pytest.approx(0.2)
     assert found.z == pytest.approx([10.0, 8.0], rel=0.15)
     assert found.rarity == pytest.approx(1 / 399)
-    assert abs(scores(np.column_stack([np.cumsum(steps), steady]), 100).z).max() < 4
+    assert abs(scores(table, 100, rows).z).max() < 4
 
 
 def test_one_of_many_numbers_far_off_is_usual_where_it_always_is() -> None:
     table = np.random.default_rng(1).normal(size=(500, 90))
     rows = np.arange(500)
     table[rows, rows % 90] = 9.0
-    assert scores(table, 250).stands_out < 4
+    assert scores(table, 250, rows[1:]).stands_out < 4
     table[250, 3] = 30.0
-    assert scores(table, 250).stands_out > 4
+    assert scores(table, 250, rows[1:]).stands_out > 4
+
+
+def test_a_frame_is_explained_alike_by_a_sample_and_by_the_whole_run(
+    best: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    whole = explain(best, 25)
+    monkeypatch.setattr("workbench.explain.MARGIN", 3)
+    read = best.sample(25, margin=3, blocks=2)
+    assert set(range(22, 29)) <= set(read["frame"].tolist())
+    for name in best.fields:
+        np.testing.assert_array_equal(read[name], best.column(name)[np.isin(best.frames, read["frame"])], name)
+    monkeypatch.setattr("workbench.explain.BLOCKS", 2)
+    part = explain(best, 25)
+    assert part.neighbours[0].frame == whole.neighbours[0].frame
+    told = [{q.field: repr(q.values) for q in one.quantities} for one in (part, whole)]
+    assert told[0] == told[1]
 
 
 def test_findings_of_the_frame_and_only_those_are_told(best: Run) -> None:
@@ -129,13 +148,41 @@ def test_findings_of_the_frame_and_only_those_are_told(best: Run) -> None:
 
 
 def test_worst_frames_are_ranked_by_harm_and_know_their_own_sum(best: Run) -> None:
-    judgement = judged(best)
-    assert judgement.budget is not None
+    judgement, budget = judged(best), budget_of(best)
+    assert budget is not None
     assert judgement.harm_m is not None
     harm = np.nan_to_num(judgement.harm_m)
-    assert harm.sum() == pytest.approx(np.hypot(*judgement.budget.end_error_m), rel=1e-6)
+    assert harm.sum() == pytest.approx(np.hypot(*budget.end_error_m), rel=1e-6)
     order = worst_frames(best, 5, judgement.harm_m)
     assert [abs(harm[best.row_of(frame)]) for frame in order] == sorted(np.abs(harm), reverse=True)[:5]
+
+
+def test_what_was_concluded_is_kept_as_long_as_it_counts(best: Run, tmp_path: Path) -> None:
+    for name in ("best.rrd", "best.toml", "sensors.rrd"):
+        shutil.copy(best.folder / name, tmp_path)
+    run = open_run(tmp_path)
+    made = judged(run)
+    assert "motion-blur" in [finding.rule for finding in made.findings]
+    kept = judged(run)
+    assert repr(kept.findings) == repr(made.findings)
+    np.testing.assert_array_equal(kept.harm_m, made.harm_m)
+    file = tmp_path / "best.judgement.json"
+    values = json.loads(file.read_text())
+    file.write_text(json.dumps(values | {"findings": []}))
+    assert judged(run).findings == ()
+    (tmp_path / "best.toml").touch()
+    assert repr(judged(run).findings) == repr(made.findings)
+    file.write_text("no JSON")
+    assert repr(judged(run).findings) == repr(made.findings)
+
+
+def test_a_finding_that_does_grave_harm_is_an_error(best: Run) -> None:
+    harm = np.zeros(FRAMES)
+    harm[25] = 1.0
+    grave, slight = (diagnose(Case.of_run(best, share * harm)) for share in (1.0, 1e-6))
+    rules = [{f.rule: f.severity for f in found} for found in (grave, slight)]
+    assert rules[0]["motion-blur"] is Severity.ERROR
+    assert rules[1]["motion-blur"] is Severity.WARNING
 
 
 def test_explain_prints_a_screenful(shell: Shell, folder: Path) -> None:

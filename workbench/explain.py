@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.estimator import quantities
-from pipelines.verdict import Severity, flags
+from pipelines.verdict import Severity, Verdict, flags
 from workbench.diagnosis.finding import Finding
 from workbench.runs import Run
 
@@ -27,7 +27,9 @@ Floats = NDArray[np.float64]
 ODD_Z = 4.0
 """A number this many standard deviations off is out of its usual range: 1 of 16 000 of a normal distribution."""
 SAMPLED = 1500
-"""Frames that the medians are taken of, evenly spread over the run."""
+"""Frames that the medians are taken of, spread over the run."""
+MARGIN, BLOCKS = 100, 16
+"""Frames to both sides that are read of a long run, and how many blocks of frames elsewhere."""
 DRIFTS = 0.2
 """A number drifts if its median change from frame to frame is below this share of its deviation."""
 NOT_JUDGED = ("frame", "t_ns", "received_ns", "verdict", "alarms")
@@ -153,11 +155,13 @@ def explain(
         RecordingError: the run has no such frame, or its file cannot be read.
     """
     row = run.row_of(frame)
-    columns = run.columns(run.fields)
-    judged = sorted((_judged(run, name, columns[name], row) for name in run.fields), key=_order)
-    told = [q for q in judged if q.odd and math.isfinite(q.value)][:followed]
     verdict = run.verdicts[row]
-    start, stop = max(0, row - around), min(len(run.frames), row + around + 1)
+    columns = run.sample(frame, margin=max(around, MARGIN), blocks=BLOCKS)
+    at = int(np.searchsorted(columns["frame"], frame))
+    rows = _sample_of(columns["frame"])
+    judged = sorted((_judged(run, name, columns[name], at, rows) for name in run.fields), key=_order)
+    told = [q for q in judged if q.odd and math.isfinite(q.value)][:followed]
+    near = run.frames[max(0, row - around) : row + around + 1]
     return Explanation(
         run=run.name,
         estimator=run.estimator,
@@ -171,7 +175,7 @@ def explain(
         error=_error_at(run, frame),
         harm_m=math.nan if harm_m is None else float(harm_m[row]),
         quantities=tuple(judged),
-        neighbours=tuple(_neighbour(run, columns, k, row, told) for k in range(start, stop)),
+        neighbours=tuple(_neighbour(columns, int(k), at, told) for k in np.searchsorted(columns["frame"], near)),
         followed=tuple(q.name for q in told),
         findings=tuple(finding for finding in findings if finding.covers(frame)),
     )
@@ -190,14 +194,24 @@ def worst_frames(run: Run, count: int, harm_m: Floats | None = None) -> list[int
     return [int(frame) for frame in run.frames[order[bad[order]]][:count]]
 
 
-def _judged(run: Run, name: str, column: NDArray[Any], row: int) -> Quantity:
+def _sample_of(frames: NDArray[np.int64]) -> NDArray[np.int64]:
+    """At most `SAMPLED` rows, evenly chosen among those whose row before is the frame before."""
+    steps = np.diff(frames)
+    if not len(steps):
+        return np.zeros(0, np.int64)
+    rows = 1 + np.flatnonzero(steps <= np.median(steps))
+    chosen: NDArray[np.int64] = rows[np.unique(np.linspace(0, len(rows) - 1, SAMPLED).astype(int))]
+    return chosen
+
+
+def _judged(run: Run, name: str, column: NDArray[Any], row: int, rows: NDArray[np.int64]) -> Quantity:
     """One field at one row, with the most unusual of its numbers."""
     about = quantities(run.step_type)[name]
     flat = column.reshape(len(column), -1)
     here = flat[row].astype(float)
     found = Scores.none(len(here))
     if name not in NOT_JUDGED and len(flat) > 1 and len(here):
-        found = scores(flat.astype(float, copy=False), row)
+        found = scores(flat.astype(float, copy=False), row, rows)
     at = _most_unusual(found.z, here) if len(here) else None
     index = np.unravel_index(at, column.shape[1:]) if at is not None and column.ndim > 1 else ()
     return Quantity(
@@ -243,9 +257,8 @@ class Scores(NamedTuple):
         return cls(nothing, nothing, nothing, np.zeros(count, bool), math.nan, math.nan)
 
 
-def scores(column: Floats, row: int) -> Scores:
-    """Judge a row of a field's numbers [n, k] by a sample of the others."""
-    rows = np.unique(np.linspace(1, len(column) - 1, SAMPLED).astype(int))
+def scores(column: Floats, row: int, rows: NDArray[np.int64]) -> Scores:
+    """Judge a row of a field's numbers [n, k] by a sample of the others, `rows` from 1 on."""
     sample, step = column[rows], column[rows] - column[rows - 1]
     change = column[row] - column[row - 1] if row else np.full(column.shape[1], np.nan)
     middle, spread = _spread(sample)
@@ -293,11 +306,11 @@ def _error_at(run: Run, frame: int) -> tuple[float, ...] | None:
     return tuple(float(v) for v in errors.values[at[0]]) if len(at) else None
 
 
-def _neighbour(run: Run, columns: Mapping[str, NDArray[Any]], k: int, row: int, told: Sequence[Quantity]) -> Neighbour:
+def _neighbour(columns: Mapping[str, NDArray[Any]], k: int, row: int, told: Sequence[Quantity]) -> Neighbour:
     return Neighbour(
-        frame=int(run.frames[k]),
-        after_s=float(run.t_ns[k] - run.t_ns[row]) / 1e9,
-        verdict=str(run.verdicts[k].name),
+        frame=int(columns["frame"][k]),
+        after_s=float(columns["t_ns"][k] - columns["t_ns"][row]) / 1e9,
+        verdict=str(Verdict(int(columns["verdict"][k])).name),
         values=tuple(float(columns[q.field][(k, *q.at)]) for q in told),
     )
 

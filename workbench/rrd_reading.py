@@ -10,7 +10,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -138,7 +138,13 @@ def _stacked(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     return ragged
 
 
-def columns(path: Path, root: str, schema: Schema, fields: Iterable[str]) -> dict[str, NDArray[Any]]:
+def columns(
+    path: Path,
+    root: str,
+    schema: Schema,
+    fields: Iterable[str],
+    choose: Callable[[Sequence[Any]], Iterable[Any]] | None = None,
+) -> dict[str, NDArray[Any]]:
     """Fields of all steps of a run as arrays [n, *shape], with ``frame`` and ``t_ns`` [n]; surfaces are not for it.
 
     Frames that lack one of the fields' entities are left out: they stood at the torn end of a file. Where the shape
@@ -149,6 +155,7 @@ def columns(path: Path, root: str, schema: Schema, fields: Iterable[str]) -> dic
         root: entity path of the run, ``/runs/RUN/ESTIMATOR``.
         schema: the rows of its steps.
         fields: names of fields.
+        choose: which of an entity's chunks to read, in their order, such as `spread`; None for all.
 
     Raises:
         RecordingError: the file cannot be read, or holds no such run.
@@ -162,7 +169,8 @@ def columns(path: Path, root: str, schema: Schema, fields: Iterable[str]) -> dic
             key = (chunk.entity_path.removeprefix(f"{root}/"), name)
             if key in groups:
                 groups[key].append(chunk)
-    rows = {key: _joined(parts, key[1]) for key, parts in groups.items()}
+    chosen = groups if choose is None else {key: list(choose(parts)) for key, parts in groups.items()}
+    rows = {key: _joined(parts, key[1]) for key, parts in chosen.items()}
     whole = functools.reduce(_common, (part.frame for part in rows.values()))
     if not len(whole):
         raise RecordingError(path, f"holds no steps of a run at {root}", "name a run of this file")
@@ -180,6 +188,17 @@ def columns(path: Path, root: str, schema: Schema, fields: Iterable[str]) -> dic
 
 def _common(one: Ints, other: Ints) -> Ints:
     return one if np.array_equal(one, other) else np.intersect1d(one, other)
+
+
+def spread(frame: int, margin: int, blocks: int) -> Callable[[Sequence[Any]], list[Any]]:
+    """A choice of chunks for `columns`: those around a frame, and `blocks` spread evenly over the whole run."""
+
+    def choose(parts: Sequence[Any]) -> list[Any]:
+        near = {id(chunk) for chunk in around(parts, range(frame - margin, frame + margin + 1))}
+        even = set(np.linspace(0, len(parts) - 1, blocks).astype(int).tolist()) if parts else set()
+        return [chunk for place, chunk in enumerate(parts) if place in even or id(chunk) in near]
+
+    return choose
 
 
 def _only(part: Series, whole: Ints) -> Series:

@@ -189,6 +189,18 @@ class Run:
             self._columns.update(found)
         return {name: self._columns[name] for name in wanted}
 
+    def sample(self, frame: int, *, margin: int, blocks: int) -> dict[str, NDArray[Any]]:
+        """All fields of the frames around one, and of a sample of the run, [m, *shape] each, ascending by ``frame``.
+
+        A short run is its own sample. Consecutive frames come in blocks.
+        """
+        from workbench import rrd_reading
+
+        if len(self.frames) <= blocks * margin:
+            return self.columns(self.fields)
+        choose = rrd_reading.spread(frame, margin, blocks)
+        return rrd_reading.columns(self.file, self.root, self.schema, self.fields, choose)
+
     def column(self, name: str) -> NDArray[Any]:
         """One field of all frames, [n, *shape]; see `columns`."""
         return self.columns([name])[name]

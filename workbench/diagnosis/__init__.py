@@ -11,7 +11,12 @@ from collections.abc import Iterable
 
 import numpy as np
 
+from pipelines.evaluation import path_lengths
+from pipelines.verdict import Severity
 from workbench.diagnosis.finding import Case, Finding, Rule
+
+GRAVE_SHARE = 0.01
+"""A finding whose frames add more than this share of the path to the end-point error is an error, whatever its rule."""
 
 
 def all_rules() -> tuple[Rule, ...]:
@@ -34,11 +39,22 @@ def diagnose(case: Case, rules: Iterable[Rule] | None = None) -> list[Finding]:
 
 
 def _with_harm(case: Case, finding: Finding) -> Finding:
-    """The finding with what its frames add to the end-point error."""
+    """The finding with what its frames add to the end-point error; an error where that is much of the path."""
     covered = np.array([finding.covers(int(frame)) for frame in case.frame])
     harm = case.harm_m[covered]
     known = np.isfinite(harm)
-    return dataclasses.replace(finding, harm_m=float(harm[known].sum())) if known.any() else finding
+    if not known.any():
+        return finding
+    total = float(harm[known].sum())
+    grave = abs(total) > GRAVE_SHARE * _path_m(case)
+    severity = max(finding.severity, Severity.ERROR) if grave else finding.severity
+    return dataclasses.replace(finding, harm_m=total, severity=severity)
+
+
+def _path_m(case: Case) -> float:
+    """Length of the reference path, infinite where it is not known."""
+    places = case.reference[np.isfinite(case.reference[:, :2]).all(axis=1), :2]
+    return float(path_lengths(places)[-1]) if len(places) > 1 else math.inf
 
 
 def _rank(finding: Finding) -> tuple[float, float, int]:

@@ -79,7 +79,8 @@ def _blurred(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
         found[k : min(stop, k + USUAL_FRAMES // 2)] = True
     longish = signals.anisotropy > bounds["anisotropy_factor"] * usual(signals.anisotropy)
     clear = signals.correlation > bounds["min_correlation"]
-    return found | lasting(longish & clear & (ratio < bounds["sharpness_ratio"]), int(bounds["min_frames"]))
+    found |= lasting(longish & clear & (ratio < bounds["sharpness_ratio"]), int(bounds["min_frames"]))
+    return found | (signals.template_row >= 0) & found[signals.template_row]  # sharp, against a blurred template
 
 
 def _tell_blur(shown: Shown) -> Told:
@@ -197,6 +198,7 @@ def _dirty(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     rigid = np.abs(signals.case["scale"] - 1.0) < bounds["max_scale_change"]  # as in noise
     matched = rigid & (signals.correlation > bounds["min_correlation"])
     always = (residual > bounds["always_factor"]) & poor[signals.template_row] & smooth & matched
+    always = lasting(always, int(bounds["min_frames"]))
     held = _held(signals, bounds, before) & (residual > bounds["held_factor"])
     weak = (poor & smooth) | held | signals.case.rings(Verdict.REACQUIRED | Verdict.LOST)
     return extended((held | always) & ~before, weak & ~before)
@@ -238,6 +240,7 @@ DIRT = Mode(
         "gradient_share": 0.8,
         "max_scale_change": 0.01,
         "min_correlation": 0.4,
+        "min_frames": 3,
     },
     shows=_dirty,
     strength=lambda signals, _: np.where(signals.accepted, signals.residual, 0.0),
