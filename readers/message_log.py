@@ -19,6 +19,7 @@ from typing import BinaryIO, NamedTuple, Protocol
 import lz4.frame  # type: ignore[import-untyped, unused-ignore]
 import zstandard
 
+from readers.salvage import Loss
 from readers.streams import Damage
 
 Buffer = bytes | memoryview
@@ -55,11 +56,16 @@ class Channel:
 
 
 class Message(NamedTuple):
-    """One message as it was stored, with its log time in nanoseconds."""
+    """One message as it was stored, with its log time in nanoseconds.
+
+    `publish_ns` and `sequence` are -1 where the container does not keep them.
+    """
 
     log_ns: int
     channel: Channel
     data: Buffer
+    publish_ns: int = -1
+    sequence: int = -1
 
 
 class Opener(Protocol):
@@ -109,6 +115,7 @@ class MessageLog(abc.ABC):
         format: what it was taken for.
         channels: all channels, with their counts and times.
         damage: what was found to be damaged so far.
+        losses: the same in the form that can be counted, of the readers that know it.
         notes: choices that the reader made, one sentence each.
     """
 
@@ -117,7 +124,14 @@ class MessageLog(abc.ABC):
         self.format = form
         self.channels: list[Channel] = []
         self.damage: list[Damage] = []
+        self.losses: list[Loss] = []
         self.notes: list[str] = []
+
+    def lose(self, loss: Loss) -> None:
+        """Note a loss, once."""
+        if loss not in self.losses:
+            self.losses.append(loss)
+            self.damage.append(loss.damage)
 
     @abc.abstractmethod
     def sources(
