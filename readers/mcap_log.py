@@ -26,6 +26,7 @@ from readers.mcap_records import (
     ChunkIndex,
     Opcode,
     RecordError,
+    Schema,
     Segment,
     Stated,
     Statistics,
@@ -88,6 +89,7 @@ class McapLog(IndexedLog):
         self.statistics: Statistics | None = None
         self._unpacked: OrderedDict[int, Future[Unpacked]] = OrderedDict()
         self._checked: set[int] = set()
+        self.told: set[int] = set()
         self._thread: ThreadPoolExecutor | None = None
         try:
             self._open()
@@ -179,6 +181,8 @@ class McapLog(IndexedLog):
             return False
         if not all(set(index.indexes) <= set(segment.channels) for index in indexes):
             return False
+        if any(record.schema and record.schema not in segment.schemas for record in segment.records.values()):
+            return False
         self._blocks = [self._block(segment, index, start) for index in indexes]
         return self._agrees(segment, self.statistics)
 
@@ -231,7 +235,12 @@ class McapLog(IndexedLog):
         """
         if opcode == Opcode.SCHEMA:
             number, schema = read_schema(body)
-            return segment.schemas.setdefault(number, schema) == schema
+            if number not in segment.schemas:
+                segment.schemas[number] = schema
+                for other, record in segment.records.items():
+                    if record.schema == number:
+                        _give_schema(segment.channels[other], schema)
+            return segment.schemas[number] == schema
         if opcode == Opcode.CHANNEL:
             number, record = read_channel(body)
             if number in segment.channels:
@@ -240,14 +249,9 @@ class McapLog(IndexedLog):
         return True
 
     def _add_channel(self, segment: Segment, number: int, record: ChannelRecord) -> None:
-        schema = segment.schemas.get(record.schema)
-        channel = Channel(
-            topic=record.topic,
-            type=schema.name if schema else "",
-            encoding=record.encoding or _DEFAULT_ENCODING.get(segment.profile, ""),
-            schema_encoding=schema.encoding if schema else "",
-            schema=schema.data if schema else b"",
-        )
+        channel = Channel(record.topic, "", record.encoding or _DEFAULT_ENCODING.get(segment.profile, ""))
+        if (schema := segment.schemas.get(record.schema)) is not None:
+            _give_schema(channel, schema)
         segment.channels[number], segment.records[number] = channel, record
         self.channels.append(channel)
 
@@ -334,7 +338,8 @@ class McapLog(IndexedLog):
         kept = KEPT_BLOCKS if block.memory_bytes * KEPT_BLOCKS <= KEPT_BYTES else 1
         while len(self._unpacked) > kept:
             self._unpacked.popitem(last=False)
-        if unpacked.faults:
+        if unpacked.faults and block.offset not in self.told:
+            self.told.add(block.offset)
             self._report_block(block, unpacked)
         return unpacked
 
@@ -418,3 +423,7 @@ class McapLog(IndexedLog):
             self._map.close()
         except BufferError:
             pass
+
+
+def _give_schema(channel: Channel, schema: Schema) -> None:
+    channel.type, channel.schema_encoding, channel.schema = schema.name, schema.encoding, schema.data

@@ -36,6 +36,7 @@ if TYPE_CHECKING:
 RUN_BYTES = 1 << 20
 WINDOW_BYTES = 1 << 22
 CHAIN = 3
+ZEROS_BYTES = 512
 _PLAUSIBLE = np.zeros(256, bool)
 _PLAUSIBLE[[*SHORTEST]] = True
 _UNREADABLE = "bytes that are no records were passed over"
@@ -100,6 +101,9 @@ class Scan:
             return at == self.size
         if at + HEAD.size > self.size:
             return self.view[at] in SHORTEST or self.view[at] == MAGIC[0]
+        zeros = self.view[at : at + ZEROS_BYTES]
+        if zeros == bytes(len(zeros)):  # a power loss leaves them
+            return True
         return bool(self._head(at)[0]) or self.view[at : at + len(MAGIC)] == MAGIC
 
     def _take(self, at: int, opcode: int, end: int) -> bool:
@@ -193,6 +197,7 @@ class Scan:
             stated = Stated(head.compression, head.stop - head.start, head.unpacked_bytes)
         block = McapBlock(start, end - start, 0, 0, {}, torn, segment=self.segment, chunk=chunk, stated=stated)
         unpacked = self.log.unpack(block)
+        self.log.told.add(start)
         if unpacked.withheld:
             counts, times = self._listed(end)
             self.cost.update(counts)
@@ -311,6 +316,10 @@ class Scan:
             )
         elif self.fault:
             self.log.report(Cause.CUT, f"{self.fault}; the file was read without it", self.size, self.size)
+        for number, record in self.segment.records.items():
+            if record.schema and record.schema not in self.segment.schemas:
+                text = f"the schema {record.schema} of {self.segment.channels[number].topic[:80]!r} is missing"
+                self.log.report(Cause.SCHEMA, text, -1, -1)
         statistics = self.log.statistics
         if statistics is None or self.segment.start:
             return
