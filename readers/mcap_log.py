@@ -26,7 +26,6 @@ from readers.mcap_records import (
     ChunkIndex,
     Opcode,
     RecordError,
-    Schema,
     Segment,
     Stated,
     Statistics,
@@ -227,33 +226,42 @@ class McapLog(IndexedLog):
             channel.count = count
         return True
 
-    def describe(self, segment: Segment, opcode: int, body: memoryview) -> bool:
-        """Take a schema or a channel; other records are passed over. False where it contradicts an earlier one.
+    def describe(self, segment: Segment, opcode: int, body: memoryview, *, sure: bool = False) -> bool:
+        """Take a schema or a channel; other records are passed over.
+
+        Returns:
+            False where it contradicts an earlier one, which it replaces if it is `sure`, guarded by a checksum.
 
         Raises:
             RecordError: it cannot be parsed.
         """
         if opcode == Opcode.SCHEMA:
             number, schema = read_schema(body)
-            if number not in segment.schemas:
+            agrees = segment.schemas.get(number, schema) == schema
+            if number not in segment.schemas or (sure and not agrees):
                 segment.schemas[number] = schema
                 for other, record in segment.records.items():
                     if record.schema == number:
-                        _give_schema(segment.channels[other], schema)
-            return segment.schemas[number] == schema
+                        self._describe_channel(segment, other, record)
+            return agrees
         if opcode == Opcode.CHANNEL:
             number, record = read_channel(body)
-            if number in segment.channels:
-                return segment.records[number] == record
-            self._add_channel(segment, number, record)
+            agrees = segment.records.get(number, record) == record
+            if number not in segment.records or (sure and not agrees):
+                self._describe_channel(segment, number, record)
+            return agrees
         return True
 
-    def _add_channel(self, segment: Segment, number: int, record: ChannelRecord) -> None:
-        channel = Channel(record.topic, "", record.encoding or _DEFAULT_ENCODING.get(segment.profile, ""))
-        if (schema := segment.schemas.get(record.schema)) is not None:
-            _give_schema(channel, schema)
-        segment.channels[number], segment.records[number] = channel, record
-        self.channels.append(channel)
+    def _describe_channel(self, segment: Segment, number: int, record: ChannelRecord) -> None:
+        if number not in segment.channels:
+            segment.channels[number] = Channel("", "", "")
+            self.channels.append(segment.channels[number])
+        segment.records[number] = record
+        channel, schema = segment.channels[number], segment.schemas.get(record.schema)
+        channel.topic = record.topic
+        channel.encoding = record.encoding or _DEFAULT_ENCODING.get(segment.profile, "")
+        if schema is not None:
+            channel.type, channel.schema_encoding, channel.schema = schema
 
     def _find_edges(self) -> None:
         """Fill in the first and last log time of every channel, from the message indexes that can hold them."""
@@ -413,6 +421,17 @@ class McapLog(IndexedLog):
         """Take a block that a scan found."""
         self._blocks.append(block)
 
+    def withhold(self, blocks: Collection[McapBlock]) -> None:
+        """Take back messages that a scan found where none should be."""
+        for block in blocks:
+            self._blocks.remove(block)
+            for channel, count in block.counts.items():
+                channel.count -= count
+            counts = {channel.topic: Tally(withheld=count) for channel, count in block.counts.items()}
+            text = f"{sum(block.counts.values())} messages outside of chunks, where the others are, are left out"
+            span = (block.offset, block.offset + block.size)
+            self.report(Cause.CHECKSUM, text, *span, counts, (block.first_ns, block.last_ns))
+
     def close(self) -> None:
         """Release the file; images that are still held keep their part of it."""
         if self._thread is not None:
@@ -423,7 +442,3 @@ class McapLog(IndexedLog):
             self._map.close()
         except BufferError:
             pass
-
-
-def _give_schema(channel: Channel, schema: Schema) -> None:
-    channel.type, channel.schema_encoding, channel.schema = schema.name, schema.encoding, schema.data

@@ -81,8 +81,8 @@ class RecordError(ValueError):
 
 
 def known(opcode: int, length: int) -> bool:
-    """Whether a record of that kind can have that length."""
-    return opcode >= PRIVATE or length >= SHORTEST.get(opcode, 1 << 64)  # type: ignore[call-overload]
+    """Whether a record of that kind can have that length; False for kinds that the format does not define."""
+    return opcode in SHORTEST and length >= SHORTEST[Opcode(opcode)]
 
 
 # ---------------------------------------------------------------------------------- bodies

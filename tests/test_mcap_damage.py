@@ -1,4 +1,4 @@
-"""Every kind of damaged and hostile MCAP file of the readers' specification: what is read, what is said, at what cost."""
+"""Every kind of damaged and hostile MCAP file: what is read, what is said, at what cost."""
 
 import resource
 import struct
@@ -55,7 +55,7 @@ def made(path: Path, codec: str = "zstd", *, index: bool = True, chunked: bool =
     rng, keys = np.random.default_rng(5), []
     with path.open("wb") as file:
         kinds = IndexType.ALL if index else IndexType.NONE
-        flags = {name: index for name in ("repeat_channels", "repeat_schemas", "use_statistics", "use_summary_offsets")}
+        flags = dict.fromkeys(("repeat_channels", "repeat_schemas", "use_statistics", "use_summary_offsets"), index)
         writer = Writer(
             file,
             chunk_size=5400,
