@@ -1,6 +1,6 @@
 """How fast logs are read beside other readers, in CPU time.
 
-    python benchmarks/readers.py [--seconds 75] [--passes 3] [--codecs none lz4 zstd]
+    python benchmarks/reading.py [--seconds 75] [--passes 3] [--codecs none lz4 zstd]
 
 The log is 512 x 512 mono8 at 20 Hz of a noisy texture, IMU at 200 Hz and odometry at 50 Hz, in chunks of 1 MiB. Every
 figure is the least CPU time of several passes of this process; a reader and its peer take turns. Extra memory is
@@ -163,7 +163,7 @@ def least(works: dict[str, Work], passes: int) -> dict[str, float]:
 MEMORY = """
 import sys, pathlib
 sys.path.insert(0, sys.argv[2])
-from benchmarks.readers import own_raw
+from benchmarks.reading import own_raw
 def anonymous():
     lines = pathlib.Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) for line in lines if line.startswith("RssAnon"))
