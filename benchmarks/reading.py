@@ -53,7 +53,9 @@ def make(path: Path, codec: str, seconds: int) -> None:
             channels[topic] = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
         for i in range(seconds * IMU_HZ):
             t_ns = START_NS + i * SECOND_NS // IMU_HZ
-            topics = ["/imu"] + ["/odom"] * (i % (IMU_HZ // ODOMETRY_HZ) == 0) + ["/image"] * (i % (IMU_HZ // IMAGE_HZ) == 0)
+            topics = (
+                ["/imu"] + ["/odom"] * (i % (IMU_HZ // ODOMETRY_HZ) == 0) + ["/image"] * (i % (IMU_HZ // IMAGE_HZ) == 0)
+            )
             for topic in topics:
                 data = bytes(store.serialize_cdr(_message(store, topic, t_ns, i, texture, rng), TYPES[topic]))
                 writer.add_message(channels[topic], t_ns, data, t_ns)
@@ -182,7 +184,11 @@ print((peak - before) / 1024)
 def extra_mib(path: Path) -> float:
     """Peak of the anonymous memory that reading the whole log takes, in MiB."""
     root = str(Path(__file__).parents[1])
-    return float(subprocess.run([sys.executable, "-c", MEMORY, str(path), root], capture_output=True, text=True, check=True).stdout)
+    return float(
+        subprocess.run(
+            [sys.executable, "-c", MEMORY, str(path), root], capture_output=True, text=True, check=True
+        ).stdout
+    )
 
 
 def bars(path: Path, codec: str, seconds: int, passes: int) -> list[tuple[str, float, float, float]]:

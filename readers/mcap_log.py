@@ -338,7 +338,7 @@ class McapLog(IndexedLog):
             future.set_result(self.unpack(block))
             self._unpacked[block.offset] = future
         for following in ahead if block.memory_bytes * KEPT_BLOCKS <= KEPT_BYTES else ():
-            if following.offset not in self._unpacked and following.size >= WORTH_A_THREAD_BYTES:
+            if following.offset not in self._unpacked and following.memory_bytes >= WORTH_A_THREAD_BYTES:
                 self._thread = self._thread or ThreadPoolExecutor(1, "unpack")
                 self._unpacked[following.offset] = self._thread.submit(self.unpack, following)
         self._unpacked.move_to_end(block.offset)
