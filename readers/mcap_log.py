@@ -7,7 +7,7 @@ Chunks are unpacked one at a time, ahead of the reading, and always compared wit
 from __future__ import annotations
 
 import mmap
-from collections import Counter, OrderedDict
+from collections import OrderedDict
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
@@ -47,6 +47,7 @@ from readers.streams import RecordingError
 READ_AHEAD = 2
 KEPT_BLOCKS = 4
 KEPT_BYTES = 1 << 24
+SHORT_READ = 8  # blocks; for so few no thread is started
 WORTH_A_THREAD_BYTES = 1 << 16
 _DEFAULT_ENCODING = {"ros1": "ros1", "ros2": "cdr"}
 
@@ -216,11 +217,14 @@ class McapLog(IndexedLog):
 
     def _agrees(self, segment: Segment, statistics: Statistics) -> bool:
         """Whether the indexes and the statistics count the same messages; keeps the counts."""
-        total: Counter[Channel] = Counter()
+        total: dict[Channel, int] = {}
         for block in self._blocks:
-            total.update(block.counts)
+            for channel, count in block.counts.items():
+                total[channel] = total.get(channel, 0) + count
         stated = {segment.channels.get(number): count for number, count in statistics.counts.items() if count}
-        if dict(+total) != stated or sum(total.values()) != statistics.messages:
+        if {channel: count for channel, count in total.items() if count} != stated or sum(
+            total.values()
+        ) != statistics.messages:
             return False
         for channel, count in total.items():
             channel.count = count
@@ -410,7 +414,7 @@ class McapLog(IndexedLog):
             and not wanted.isdisjoint(block.counts)
         ]
         for place, block in enumerate(blocks):
-            ahead = blocks[place + 1 : place + 1 + READ_AHEAD] if place else ()
+            ahead = blocks[place + 1 : place + 1 + READ_AHEAD] if place >= SHORT_READ else ()
 
             def open_it(block: McapBlock = block, ahead: Collection[McapBlock] = ahead) -> Iterator[Message]:
                 return self._chosen(block, ahead, wanted, start_ns, stop_ns)

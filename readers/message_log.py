@@ -9,6 +9,7 @@ from __future__ import annotations
 import abc
 import bz2
 import heapq
+import re
 import threading
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -29,6 +30,7 @@ except ImportError:
     from zlib import crc32 as crc32
 
 Buffer = bytes | memoryview
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 LARGEST_BLOCK_BYTES = 2**30
 LARGEST_UNPACKED_BYTES = 2**28
 LARGEST_RATIO = 1024
@@ -383,3 +385,8 @@ def _unpack(compression: str, data: Buffer, size: int, limit: int, torn: bool) -
 def text(raw: Buffer) -> str:
     """Decode UTF-8; bytes that are not UTF-8 come out as backslash escapes."""
     return bytes(raw).decode("utf-8", "backslashreplace")
+
+
+def name(raw: Buffer) -> str:
+    """Decode a name; control characters come out as backslash escapes too, so that it can be shown anywhere."""
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text(raw))

@@ -353,7 +353,10 @@ def test_times_at_the_ends_of_their_range_are_kept(tmp_path: Path) -> None:
 )
 def test_hostile_names_are_data(tmp_path: Path, topic: bytes) -> None:
     found, log = hostile(tmp_path, record(CHANNEL, channel(1, 0, topic, "cdr", {})), good_chunk())
-    assert {key[0] for key in found} == {topic.decode("utf-8", "backslashreplace")}
+    (name,) = {key[0] for key in found}
+    assert len(found) == 24
+    assert name.isprintable()
+    assert len(name) >= len(topic)
     assert log.losses == []
 
 
