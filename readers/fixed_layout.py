@@ -62,6 +62,7 @@ _START = struct.Struct("<4siII")
 _U32 = struct.Struct("<I")
 _IMAGE_SIZE = struct.Struct("<II")
 _IMU_NUMBERS, _ODOMETRY_NUMBERS = 37, 85
+_FLOAT = np.dtype("<f8")
 _LITTLE_ENDIAN = b"\0\1\0\0"
 
 
@@ -124,8 +125,7 @@ def _imu(data: Buffer, arrival: Arrival) -> Sample | None:
     at = header[1] + (4 - header[1]) % 8
     if at + 8 * _IMU_NUMBERS != len(data):
         return None
-    n = np.frombuffer(data, "<f8", _IMU_NUMBERS, at).copy()
-    n.setflags(write=False)
+    n = np.frombuffer(bytes(data[at:]), _FLOAT)  # a copy, which does not keep the chunk, and read-only
     return imu_sample(arrival, header[0], n[:4], n[4:13], n[13:16], n[16], n[25:28], n[28])
 
 
@@ -139,10 +139,8 @@ def _odometry(data: Buffer, arrival: Arrival) -> Sample | None:
     at += (4 - at) % 8
     if at + 8 * _ODOMETRY_NUMBERS != len(data):
         return None
-    n = np.frombuffer(data, "<f8", _ODOMETRY_NUMBERS, at)
-    moving = np.concatenate((n[:7], n[43:49]))
-    moving.setflags(write=False)
-    return odometry_sample(arrival, header[0], moving[:3], moving[3:7], moving[7:10], moving[10:])
+    n = np.frombuffer(bytes(data[at:]), _FLOAT)
+    return odometry_sample(arrival, header[0], n[:3], n[3:7], n[43:46], n[46:49])
 
 
 def _image(data: Buffer, arrival: Arrival) -> Sample | None:

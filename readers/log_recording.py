@@ -33,6 +33,7 @@ from readers.messages import (
     samples_of,
     stamp_ns,
 )
+from readers.salvage import Loss
 from readers.streams import (
     Camera,
     CameraInfo,
@@ -285,6 +286,11 @@ class LogRecording(Recording):
             for log in self._logs
             for harm in log.damage
         )
+
+    @property
+    def losses(self) -> tuple[Loss, ...]:
+        """What could not be read, in the form that can be counted, as far as the files were read by now."""
+        return tuple(loss for log in self._logs for loss in log.losses)
 
     # ------------------------------------------------------------------------------ cameras
 

@@ -83,6 +83,8 @@ class McapLog(IndexedLog):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "MCAP")
+        if not path.stat().st_size:
+            raise RecordingError(path, "the file is empty (0 bytes)", "record or copy it again")
         with path.open("rb") as file:
             self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self.view = memoryview(self._map)

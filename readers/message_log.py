@@ -215,7 +215,7 @@ class IndexedLog(MessageLog):
             if stop_ns is not None and block.first_ns >= stop_ns:
                 continue
             if wanted & block.channels:
-                yield Source(block.first_ns, partial(self._select, block, wanted, start_ns, stop_ns), block.last_ns)
+                yield Source(block.first_ns, partial(self._select, block, wanted, start_ns, stop_ns))
 
     def count_before(self, channels: Collection[Channel], stop_ns: int) -> int:
         """How many messages of `channels` were logged before `stop_ns`, by the index for all but the last blocks.
