@@ -8,9 +8,8 @@ from __future__ import annotations
 
 import mmap
 from collections import OrderedDict
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -24,6 +23,7 @@ from readers.mcap_records import (
     MAGIC,
     ChannelRecord,
     ChunkIndex,
+    McapBlock,
     Opcode,
     RecordError,
     Segment,
@@ -40,6 +40,7 @@ from readers.mcap_records import (
     unpack_chunk,
     walk,
 )
+from readers.mcap_scan import Scan
 from readers.message_log import Block, Channel, IndexedLog, Message, Source, crc32
 from readers.salvage import Cause, Loss, Tally
 from readers.streams import RecordingError
@@ -50,28 +51,6 @@ KEPT_BYTES = 1 << 24
 SHORT_READ = 8  # blocks; for so few no thread is started
 WORTH_A_THREAD_BYTES = 1 << 16
 _DEFAULT_ENCODING = {"ros1": "ros1", "ros2": "cdr"}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class McapBlock(Block):
-    """A chunk, or a run of messages outside of chunks.
-
-    `stated` is what the chunk index says of it, `indexes` the offsets of its message indexes by channel.
-    """
-
-    segment: Segment
-    chunk: bool = True
-    stated: Stated | None = None
-    indexes: Mapping[Channel, int] = field(default_factory=dict)
-
-    def of(self, first_ns: int, last_ns: int, counts: Mapping[Channel, int]) -> McapBlock:
-        """The same block, whose content is known."""
-        return replace(self, first_ns=first_ns, last_ns=last_ns, counts=counts)
-
-    @property
-    def memory_bytes(self) -> int:
-        """How much memory it takes to unpack it; none where it lies in the file as it is."""
-        return self.stated.unpacked_bytes if self.stated is not None and self.stated.compression else 0
 
 
 class McapLog(IndexedLog):
@@ -100,8 +79,6 @@ class McapLog(IndexedLog):
             raise
 
     def _open(self) -> None:
-        from readers.mcap_scan import Scan
-
         if self.view[: len(MAGIC)] != MAGIC:
             raise RecordingError(self.path, "it does not begin like an MCAP file", "check that the file is complete")
         segment = Segment(profile=self.profile(0))
@@ -357,12 +334,6 @@ class McapLog(IndexedLog):
             self._report_block(block, unpacked)
         return unpacked
 
-    def messages_of(self, block: McapBlock, channels: Collection[Channel] | None = None) -> Walked:
-        """The messages of the channels (all if None) in one block, in the order of the file."""
-        numbered = block.segment.channels
-        wanted = {n: c for n, c in numbered.items() if c in channels} if channels is not None else numbered
-        return walk(self._load(block).records, block.segment, wanted)
-
     def _select(
         self, block: Block, channels: Collection[Channel], start_ns: int | None, stop_ns: int | None
     ) -> Iterator[Message]:
@@ -383,9 +354,9 @@ class McapLog(IndexedLog):
         wanted = {number: channel for number, channel in block.segment.channels.items() if channel in channels}
         walked = walk(unpacked.records, block.segment, wanted)
         messages = walked.messages
-        self._compare(block, walked, sum(block.counts.get(channel, 0) for channel in wanted.values()))
         if not walked.ordered:
             messages.sort(key=lambda message: message.log_ns)
+        self._compare(block, walked, sum(block.counts.get(channel, 0) for channel in wanted.values()))
         if start_ns is not None and block.first_ns < start_ns:
             messages = [message for message in messages if message.log_ns >= start_ns]
         if stop_ns is not None and block.last_ns >= stop_ns:

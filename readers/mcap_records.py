@@ -9,13 +9,13 @@ import enum
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from readers.message_log import Channel, DamagedBlockError, Message, crc32, inflate, name, text
+from readers.message_log import Block, Channel, DamagedBlockError, Message, crc32, inflate, name, text
 from readers.salvage import Cause
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -297,6 +297,28 @@ class Segment:
     schemas: dict[int, Schema] = field(default_factory=dict)
     records: dict[int, ChannelRecord] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class McapBlock(Block):
+    """A chunk, or a run of messages outside of chunks.
+
+    `stated` is what the chunk index says of it, `indexes` the offsets of its message indexes by channel.
+    """
+
+    segment: Segment
+    chunk: bool = True
+    stated: Stated | None = None
+    indexes: Mapping[Channel, int] = field(default_factory=dict)
+
+    def of(self, first_ns: int, last_ns: int, counts: Mapping[Channel, int]) -> McapBlock:
+        """The same block, whose content is known."""
+        return replace(self, first_ns=first_ns, last_ns=last_ns, counts=counts)
+
+    @property
+    def memory_bytes(self) -> int:
+        """How much memory it takes to unpack it; none where it lies in the file as it is."""
+        return self.stated.unpacked_bytes if self.stated is not None and self.stated.compression else 0
 
 
 @dataclass(slots=True)

@@ -17,6 +17,7 @@ from readers.mcap_records import (
     MAGIC,
     PRIVATE,
     SHORTEST,
+    McapBlock,
     Opcode,
     RecordError,
     Segment,
@@ -32,7 +33,7 @@ from readers.message_log import Channel, crc32
 from readers.salvage import Cause, Tally
 
 if TYPE_CHECKING:
-    from readers.mcap_log import McapBlock, McapLog
+    from readers.mcap_log import McapLog
 
 RUN_BYTES = 1 << 20
 WINDOW_BYTES = 1 << 22
@@ -63,6 +64,7 @@ class Scan:
         self.loose: list[McapBlock] = []
         self.chunked = False
         self.losses = len(log.losses)
+        self.magic = 0  # where the next file that was joined may begin, -1 if none does
 
     def run(self) -> None:
         """Walk from the first record to the end of the file."""
@@ -109,9 +111,9 @@ class Scan:
             return at == self.size
         if at + HEAD.size > self.size:
             return self.view[at] in SHORTEST or self.view[at] == MAGIC[0]
-        zeros = self.view[at : at + ZEROS_BYTES]
-        if zeros == bytes(len(zeros)):  # a power loss leaves them
-            return True
+        if self.view[at] == 0:  # a power loss leaves zeros
+            zeros = self.view[at : at + ZEROS_BYTES]
+            return zeros == bytes(len(zeros))
         opcode, end = self._head(at)
         if not opcode and self.view[at] in UNDEFINED:
             return end <= self.size and (end == self.size or bool(self._head(end)[0]))
@@ -213,8 +215,6 @@ class Scan:
 
     def _block(self, start: int, end: int, *, chunk: bool = True, torn: bool = False) -> int:
         """Read a block once, count what it holds and give it to the log; the number of its messages."""
-        from readers.mcap_log import McapBlock
-
         stated = None
         if chunk:
             head = read_chunk_head(self.view[start + HEAD.size : end])
@@ -294,7 +294,9 @@ class Scan:
 
     def _search(self, start: int, *, chunks_only: bool = False) -> int:
         """The first place from `start` on from which several records follow each other, -1 if there is none."""
-        magic = self.log.find(MAGIC, start)
+        if 0 <= self.magic < start:
+            self.magic = self.log.find(MAGIC, start)
+        magic = self.magic
         stop = magic if 0 <= magic < self.size - len(MAGIC) else self.size
         for window in range(start, stop, WINDOW_BYTES):
             raw = np.frombuffer(self.view[window : min(window + WINDOW_BYTES + HEAD.size, stop)], np.uint8)
