@@ -168,8 +168,10 @@ class McapLog(IndexedLog):
     def _block(self, segment: Segment, index: ChunkIndex, limit: int) -> McapBlock:
         if index.offset + index.length > limit or index.length < HEAD.size or index.first_ns > index.last_ns:
             raise RecordError
-        indexes = {segment.channels[number]: at for number, at in index.indexes.items()}
-        counts = {segment.channels[number]: self._indexed_count(number, at) for number, at in index.indexes.items()}
+        indexes, counts = {}, {}
+        for number, at in index.indexes.items():
+            channel = segment.channels[number]
+            indexes[channel], counts[channel] = at, self._indexed_count(number, at)
         return McapBlock(
             index.offset,
             index.length,

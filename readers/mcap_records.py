@@ -25,7 +25,8 @@ INDEX_HEAD = struct.Struct("<BQHI")
 _MESSAGE = struct.Struct("<BQHIQQ")
 _MESSAGE_BYTES = _MESSAGE.size - HEAD.size
 _CHUNK = struct.Struct("<QQQI")
-_CHUNK_INDEX = struct.Struct("<QQQQ")
+_CHUNK_INDEX = struct.Struct("<QQQQI")
+_LENGTH_AND_NAME = struct.Struct("<QI")
 _SIZES = struct.Struct("<QQ")
 _COUNT = struct.Struct("<HQ")
 _OFFSET = struct.Struct("<HQ")
@@ -162,19 +163,22 @@ class ChunkIndex(NamedTuple):
 
 def read_chunk_index(body: memoryview) -> ChunkIndex:
     """A chunk index record."""
-    first_ns, last_ns, offset, length = _unpack(_CHUNK_INDEX, body)
-    pairs, at = _sized(body, _CHUNK_INDEX.size)
-    indexes = dict(_pairs(_OFFSET, pairs))
-    (_,) = _unpack(_U64, body, at)
-    compression, at = _sized(body, at + 8)
-    packed, unpacked = _unpack(_SIZES, body, at)
-    return ChunkIndex(first_ns, last_ns, offset, length, indexes, text(compression), packed, unpacked)
+    try:
+        first_ns, last_ns, offset, length, size = _CHUNK_INDEX.unpack_from(body)
+        end = _CHUNK_INDEX.size + size
+        pairs = dict(_pairs(_OFFSET, body[_CHUNK_INDEX.size : end]))
+        _, size = _LENGTH_AND_NAME.unpack_from(body, end)
+        compression = body[end + _LENGTH_AND_NAME.size :][:size]
+        packed, unpacked = _SIZES.unpack_from(body, end + _LENGTH_AND_NAME.size + size)
+    except struct.error as error:
+        raise RecordError from error
+    return ChunkIndex(first_ns, last_ns, offset, length, pairs, text(compression), packed, unpacked)
 
 
 def _pairs(layout: struct.Struct, packed: memoryview) -> Iterator[tuple[int, int]]:
     if len(packed) % layout.size:
         raise RecordError
-    yield from layout.iter_unpack(packed)
+    return layout.iter_unpack(packed)
 
 
 class Statistics(NamedTuple):
