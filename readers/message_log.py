@@ -20,14 +20,10 @@ from typing import BinaryIO, NamedTuple, Protocol
 
 import lz4.frame  # type: ignore[import-untyped, unused-ignore]
 import zstandard
+from isal.isal_zlib import crc32 as crc32
 
 from readers.salvage import Loss
 from readers.streams import Damage
-
-try:  # the same checksum, four times as fast
-    from isal.isal_zlib import crc32 as crc32  # type: ignore[import-not-found, unused-ignore]
-except ImportError:
-    from zlib import crc32 as crc32
 
 Buffer = bytes | memoryview
 _CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")

@@ -39,12 +39,15 @@ from workbench.terminal import (
 if TYPE_CHECKING:
     from pipelines.simulation.mission import SimulatedMission
     from readers.streams import Camera, ReadOptions, Recording, StreamInfo
+    from workbench.diagnosis.finding import Finding
     from workbench.reproduce import report as reports_a
     from workbench.reproduce.judged import Statement
     from workbench.reproduce.plans import Reproduced
     from workbench.reproduce.ranging.results import Results as RangeResults
     from workbench.session import Outcome, Request
 
+
+MOST_FINDINGS = 5
 
 app = typer.Typer(
     name="workbench",
@@ -334,11 +337,25 @@ def replay(
 
 def _conclude(outcome: Outcome, as_json: bool) -> NoReturn:
     """Print what became of a replay and leave with its exit status."""
+    findings, refused = _findings_of(outcome)
     if as_json:
-        print_json(outcome.summary | {"folder": str(outcome.folder), "files": _files(outcome)})
+        told = {"findings": [cli_runs.finding_values(finding) for finding in findings], "not_judged": refused}
+        print_json(outcome.summary | told | {"folder": str(outcome.folder), "files": _files(outcome)})
     else:
-        _print_summary(outcome)
+        _print_summary(outcome, findings, refused)
     raise typer.Exit(_status(outcome))
+
+
+def _findings_of(outcome: Outcome) -> tuple[Sequence[Finding], str]:
+    """What the diagnosis of a finished replay found; or why there is none."""
+    from readers.streams import WorkbenchError
+    from workbench.judgement import judged
+    from workbench.runs import open_run
+
+    try:
+        return judged(open_run(outcome.run_file)).findings, ""
+    except WorkbenchError as error:
+        return (), str(error)
 
 
 def _replay(request: Request, recording: Recording | None = None) -> Outcome:
@@ -370,10 +387,14 @@ def _files(outcome: Outcome) -> list[str]:
     return [str(file) for file in files]
 
 
-def _print_summary(outcome: Outcome) -> None:
+def _print_summary(outcome: Outcome, findings: Sequence[Finding] = (), refused: str = "") -> None:
     from workbench.summary import lines
 
-    rows = lines(outcome.summary)
+    rows = [*lines(outcome.summary), *(("finding", cli_runs.finding_line(one)) for one in findings[:MOST_FINDINGS])]
+    if len(findings) > MOST_FINDINGS:
+        rows.append(("finding", f"{len(findings) - MOST_FINDINGS} more; workbench report shows all"))
+    if refused:
+        rows.append(("finding", f"none, the run cannot be judged: {refused}"))
     width = max(len(name) for name, _ in rows)
     before = ""
     for name, text in rows:
@@ -381,6 +402,9 @@ def _print_summary(outcome: Outcome) -> None:
         before = name
     print(f"{'result':<{width}}  {outcome.run_file}")
     print(f"{'look at it':<{width}}  workbench view {outcome.run_file}")
+    if findings:
+        frame = findings[0].worst_frame
+        print(f"{'ask why':<{width}}  workbench explain {outcome.run_file} --frame {frame}")
 
 
 # ------------------------------------------------------------------------------- simulate

@@ -33,6 +33,7 @@ from workbench.terminal import (
 if TYPE_CHECKING:
     from workbench.check import Checked
     from workbench.compare import Comparison, Parting
+    from workbench.diagnosis.finding import Finding
     from workbench.explain import Explanation, Quantity
     from workbench.runs import Run
 
@@ -246,7 +247,14 @@ def _explanation_values(one: Explanation) -> dict[str, Any]:
     }  # fmt: skip
 
 
-def finding_values(finding: Any) -> dict[str, Any]:
+def finding_line(finding: Finding) -> str:
+    """A finding in a line."""
+    harm = "" if math.isnan(finding.harm_m) else f" (harm {finding.harm_m:+.3g} m)"
+    where = _spans(finding.spans)
+    return f"{finding.severity.name.lower()}: {finding.rule}, {where}{harm}: {finding.sentence}"
+
+
+def finding_values(finding: Finding) -> dict[str, Any]:
     """A finding as plain values."""
     return {**dataclasses.asdict(finding), "severity": finding.severity.name.lower()}
 
