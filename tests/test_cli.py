@@ -21,8 +21,9 @@ import workbench.session
 import workbench.settings
 from readers.streams import Fact, StreamKind, WorkbenchError
 from tests import toy_session
-from tests.toy_session import START, TextLog, ToyMission, ToyRun
+from tests.toy_session import START, TextLog, ToyMission, ToyRun, toy_rows
 from tests.toys import image
+from workbench import manifest
 from workbench.cli import files_of, main, moment, shown, table, view_command
 from workbench.inputs import digest, parse_time
 
@@ -99,6 +100,7 @@ def test_a_replay_leaves_a_run_folder_and_a_summary(toys: Path, shell: Shell) ->
     folder = toys / "results" / "walk-camera"
     assert sorted(p.name for p in folder.iterdir()) == [
         "best.rrd",
+        "best.sha256",
         "best.toml",
         "best.tum",
         "sensors.rrd",
@@ -481,6 +483,9 @@ def test_an_interrupt_ends_with_status_130_and_whole_files(tmp_path: Path, numbe
     assert sum(line.startswith("step") for line in steps) == summary["frames"]
     assert steps[-1].startswith("finish")
     assert not (folder / "sensors.toml").exists()
+    checks = manifest.verify(folder, "best", toy_rows)
+    assert {check.name for check in checks} == {"best.rrd", "best.toml", "best.tum", "sensors.rrd"}
+    assert not any(check.problems for check in checks)
 
 
 def test_a_second_interrupt_ends_at_once_and_is_noted(
@@ -493,6 +498,7 @@ def test_a_second_interrupt_ends_at_once_and_is_noted(
     assert shell.replay("walk.log").status == 130
     state = tomllib.loads(Path("results/walk/best.toml").read_text())
     assert (state["complete"], state["interrupted"]) == (False, True)
+    assert not Path("results/walk/best.sha256").exists()
     assert len(Path("results/walk/best.tum").read_text().splitlines()) == 40
 
 

@@ -574,6 +574,48 @@ def _has_display() -> bool:
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
 
 
+# --------------------------------------------------------------------------------- verify
+
+
+@app.command(
+    short_help="Check that the files of a run are what was written.",
+    epilog=examples(
+        "workbench verify results/mission",
+        "workbench verify results/mission/best.rrd --json",
+        "cd results/mission && sha256sum -c best.sha256",
+    ),
+)
+def verify(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="RUN.rrd files, or folders of results", show_default=False)
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Hold the files of runs against their manifests, RUN.sha256: every byte, and the rows of every entity.
+
+    Exit status 0: all is as it was written; 3: something differs, which is named; 2: there is no manifest to go by.
+    """
+    from workbench import manifest
+
+    found = {
+        str(folder / name): manifest.verify(folder, name) for run in runs for folder, name in manifest.runs_of(run)
+    }
+    good = not any(check.problems for checks in found.values() for check in checks)
+    if as_json:
+        told = {
+            run: {c.name: {"rows": c.rows, "problems": list(c.problems)} for c in checks}
+            for run, checks in found.items()
+        }
+        print_json({"good": good, "runs": told})
+    else:
+        for run, checks in found.items():
+            print(shown(run))
+            for check in checks:
+                counted = f", {check.rows} rows" if check.rows else ""
+                print(f"  {shown(check.name)}: {'; '.join(map(shown, check.problems)) or 'as written' + counted}")
+    raise typer.Exit(0 if good else IN_PART)
+
+
 # ----------------------------------------------------------------------------------- demo
 
 

@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -232,6 +233,24 @@ def stored_image(path: Path, entity: str, frame: int) -> Mapping[str, Any] | Non
             if any(found.values()):
                 return found
     return None
+
+
+def stored_rows(path: Path) -> dict[str, int]:
+    """How many rows each entity holds, static ones included, counted over the data and not by the footer.
+
+    Raises:
+        RecordingError: the file cannot be read whole.
+    """
+    rows: Counter[str] = Counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            for chunk in RrdReader(path).stream():
+                rows[chunk.entity_path] += chunk.num_rows
+        except (RuntimeError, ValueError, OSError) as error:
+            reason = (str(error).splitlines() or ["no reason given"])[0]
+            raise RecordingError(path, f"cannot be read whole ({reason})", "replay the recording again") from error
+    return dict(rows)
 
 
 # ------------------------------------------------------------------------- whole files

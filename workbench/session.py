@@ -1,7 +1,8 @@
 """One replay, from a path to a run folder: open, choose, replay, judge, write.
 
 The run folder holds, once per mission, `sensors.rrd` (with `sensors.toml`, which says what is in it), and per
-run `RUN.rrd`, `RUN.toml` (settings, versions, input digest, window, summary) and `RUN.tum` (trajectory).
+run `RUN.rrd`, `RUN.toml` (settings, versions, input digest, window, summary), `RUN.tum` (trajectory) and `RUN.sha256`
+(the manifest of these files, see `workbench.manifest`).
 An interrupt is noticed between two frames; everything up to there is written, the files are closed, and
 RUN.toml says so. Nothing of the wall clock goes into the files.
 """
@@ -45,7 +46,7 @@ from readers.streams import (
     StreamError,
     StreamInfo,
 )
-from workbench import inputs, range_inputs
+from workbench import inputs, manifest, range_inputs
 from workbench.range_account import RangeAccount
 from workbench.range_smoothing import Smoothing
 from workbench.settings import Plugin, Resolved, SettingsError, plugin, resolve, settings_values, to_toml
@@ -142,11 +143,12 @@ class Writers(NamedTuple):
     Both are called with the file and, by name, the `recording_id`, the `run`, the name of its `estimator` and its
     `step_type`; `sensors` with `raw_images` as well, `run` with `settings_text`, `ground` [n, 2], positions of the
     reference in m that the map shows (None where there are none, or the path is not in metres), and `scene`, what
-    the drawing of this estimator's steps needs to know beyond them.
+    the drawing of this estimator's steps needs to know beyond them. `rows` counts the rows of a written file.
     """
 
     sensors: Callable[..., SensorLog]
     run: Callable[..., RunLog]
+    rows: manifest.CountRows = manifest.stored_rows
 
 
 def rerun_writers() -> Writers:
@@ -563,11 +565,14 @@ class _Session:
             self._write_toml({"complete": False, "summary": {"interrupted": True}})
             raise
         self._write_toml({"complete": True, "summary": summary})
+        made = manifest.taken(self.folder, self.name, writers.rows)
+        _replace(manifest.file_of(self.folder, self.name), made.text())
         return Outcome(self.folder, self._file("rrd"), self.folder / "sensors.rrd", summary)
 
     def _make_folder(self) -> None:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
+            manifest.file_of(self.folder, self.name).unlink(missing_ok=True)
             self._write_toml({"complete": False})
         except OSError as error:
             problem = f"no results can be written there ({error.strerror or error})"
