@@ -55,11 +55,12 @@ class Channel:
 
 
 class Message(NamedTuple):
-    """One message as it was stored, with its log time in nanoseconds."""
+    """One message as it was stored, with its log time in nanoseconds; publish time -1 where the container has none."""
 
     log_ns: int
     channel: Channel
     data: Buffer
+    published_ns: int = -1
 
 
 class Opener(Protocol):

@@ -37,7 +37,7 @@ from workbench.terminal import (
 
 if TYPE_CHECKING:
     from pipelines.simulation.mission import SimulatedMission
-    from readers.streams import Camera, ReadOptions, Recording, StreamInfo
+    from readers.streams import Camera, Clock, ReadOptions, Recording, StreamInfo
     from workbench.reproduce import report as reports_a
     from workbench.reproduce.judged import Statement
     from workbench.reproduce.plans import Reproduced
@@ -78,6 +78,14 @@ TimeFrames = Annotated[
     list[str] | None,
     typer.Option("--tf", metavar="PARENT,CHILD", help="Pair of frames in /tf to read as a pose stream; repeatable."),
 ]
+Clocks = Annotated[
+    list[str] | None,
+    typer.Option("--clock", metavar="TOPIC=CLOCK", help="Times of a topic: header, log or publish; repeatable."),
+]
+Offsets = Annotated[
+    list[str] | None,
+    typer.Option("--offset", metavar="TOPIC=MS", help="Milliseconds to add to the times of a topic; repeatable."),
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 
 
@@ -109,13 +117,15 @@ def inspect(
     times: TimesFile = None,
     times_unit: TimesUnit = "auto",
     tf: TimeFrames = None,
+    clocks: Clocks = None,
+    offsets: Offsets = None,
 ) -> None:
     """Show what is in a recording: streams, cameras, damage, and what is odd about its clocks."""
     from workbench.session import open_any
 
-    with open_any(path, _options(rate, times, times_unit, tf)) as recording:
-        facts = [] if quick else _survey(recording)
-        values = _recording_values(recording, facts)
+    with open_any(path, _options(rate, times, times_unit, tf, clocks, offsets)) as recording:
+        facts, clocks_found = ([], {}) if quick else _survey(recording)
+        values = _recording_values(recording, facts) | {"clocks": clocks_found}
         if as_json:
             print_json(values)
         else:
@@ -124,13 +134,26 @@ def inspect(
             raise typer.Exit(IN_PART)
 
 
-def _survey(recording: Recording) -> list[dict[str, Any]]:
-    from readers.clock import survey
+def _survey(recording: Recording) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """The oddities of a recording; and by stream how log time stands to header stamps and publish times, ms."""
+    from readers.clock import Lag, examine
 
-    return [
+    def milliseconds(lag: Lag) -> dict[str, Any] | None:
+        if not lag.messages:
+            return None
+        told = {"least_ms": lag.least_ns, "median_ms": lag.median_ns, "greatest_ms": lag.greatest_ns}
+        return {"messages": lag.messages} | {name: ns / 1e6 for name, ns in told.items()}
+
+    found = examine(recording)
+    facts = [
         {"stream": fact.stream, "code": fact.code, "count": fact.count, "sentence": fact.sentence}
-        for fact in survey(recording)
+        for fact in found.facts
     ]
+    lags = {
+        name: {"log_after_header": milliseconds(audit.lag), "log_after_publish": milliseconds(audit.publish_lag)}
+        for name, audit in found.audits.items()
+    }
+    return facts, {name: values for name, values in lags.items() if any(values.values())}
 
 
 def _recording_values(recording: Recording, facts: list[dict[str, Any]]) -> dict[str, Any]:
@@ -189,10 +212,24 @@ def _print_recording(recording: Recording, values: Mapping[str, Any]) -> None:
     print("\n".join(table(heads, rows, right=(2, 3, 4, 5))) if rows else "no streams")
     for name, camera in recording.cameras.items():
         print(f"\ncamera of {shown(name)}: {_camera_text(camera)}")
+    _print_clocks(values["clocks"])
     print_list("notes", values["notes"])
     print_list("not readable", [_unreadable(info) for info in recording.streams if not info.readable])
     print_list("damage", values["damage"])
     print_list("oddities", [f"{fact['stream']}: {fact['sentence']}" for fact in values["facts"]])
+
+
+def _print_clocks(clocks: Mapping[str, Any]) -> None:
+    """Print how late log time is after header stamps and publish times."""
+    rows = [
+        (name, kind, str(lag["messages"]), *(f"{lag[k]:.3f}" for k in ("least_ms", "median_ms", "greatest_ms")))
+        for name, lags in clocks.items()
+        for kind, lag in (("header", lags["log_after_header"]), ("publish", lags["log_after_publish"]))
+        if lag is not None
+    ]
+    if rows:
+        heads = ("log time after", "clock", "messages", "least ms", "median ms", "greatest ms")
+        print("\n" + "\n".join(table(heads, rows, right=(2, 3, 4, 5))))
 
 
 def _unreadable(info: StreamInfo) -> str:
@@ -294,6 +331,8 @@ def replay(
     times: TimesFile = None,
     times_unit: TimesUnit = "auto",
     tf: TimeFrames = None,
+    clocks: Clocks = None,
+    offsets: Offsets = None,
     as_json: AsJson = False,
 ) -> None:
     """Replay a recording through an estimator; write all it computed, and a summary.
@@ -323,7 +362,7 @@ def replay(
         reference=reference,
         reference_offset_s=reference_offset,
         height=height,
-        options=_options(rate, times, times_unit, tf),
+        options=_options(rate, times, times_unit, tf, clocks, offsets),
         calibrate=calibrate,
         smooth=smooth,
         raw_images=_one_of(raw_images, ("png", "raw"), "--raw-images"),
@@ -857,7 +896,14 @@ def settings(
 # -------------------------------------------------------------------------------- helpers
 
 
-def _options(rate: float | None, times: Path | None, unit: str, frames: Sequence[str] | None) -> ReadOptions:
+def _options(
+    rate: float | None,
+    times: Path | None,
+    unit: str,
+    frames: Sequence[str] | None,
+    clocks: Sequence[str] | None = None,
+    offsets: Sequence[str] | None = None,
+) -> ReadOptions:
     from readers.streams import ReadOptions, StreamError
 
     if rate is not None and not 0 < rate < float("inf"):
@@ -873,7 +919,38 @@ def _options(rate: float | None, times: Path | None, unit: str, frames: Sequence
         times_file=times,
         times_unit=_one_of(unit, ("auto", "s", "ms", "us", "ns"), "--times-unit"),
         pose_frames=tuple(pairs),
+        clocks=_clocks(clocks or ()),
+        offsets_ns=_offsets(offsets or ()),
     )
+
+
+def _clocks(texts: Sequence[str]) -> tuple[tuple[str, Clock], ...]:
+    """Topics and their clocks."""
+    from readers.streams import Clock, StreamError
+
+    found = {}
+    for text in texts:
+        topic, _, clock = text.rpartition("=")
+        if not topic or clock not in set(Clock):
+            raise StreamError(f"--clock {text}: write a topic and header, log or publish, such as --clock /imu=log")
+        found[topic] = Clock(clock)
+    return tuple(found.items())
+
+
+def _offsets(texts: Sequence[str]) -> tuple[tuple[str, int], ...]:
+    """Topics and their offsets in ns."""
+    from readers.streams import StreamError
+
+    found = {}
+    for text in texts:
+        topic, _, number = text.rpartition("=")
+        try:
+            found[topic] = round(float(number) * 1e6)
+        except (ValueError, OverflowError):
+            topic = ""
+        if not topic:
+            raise StreamError(f"--offset {text}: write a topic and milliseconds, such as --offset /camera=-12.5")
+    return tuple(found.items())
 
 
 def _one_of(text: str, known: Sequence[str], option: str) -> str:

@@ -203,10 +203,11 @@ def open_any(path: Path, options: ReadOptions) -> Recording:
         SettingsError: it is a scenario that cannot be.
     """
     from readers import open_recording
+    from readers.adjusted import adjusted
     from workbench.scenarios import is_scenario, open_scenario
 
     if is_scenario(path):
-        return open_scenario(path)
+        return adjusted(open_scenario(path), options)
     return open_recording(path, options)
 
 
@@ -757,6 +758,7 @@ class _Session:
         return {
             "format": FORMAT,
             "digest": self.digest,
+            **clock_values(self.request.options),
             "image_stream": self.chosen.shown or self.chosen.frames,
             "reference_stream": self.chosen.reference.stream,
             "raw_images": self.request.raw_images,
@@ -775,6 +777,7 @@ class _Session:
                 "preset": self.preset,
                 "recording": str(self.request.path),
                 "digest": self.digest,
+                **clock_values(self.request.options),
                 "image_stream": self.chosen.frames,
                 "reference_stream": self.chosen.reference.stream,
                 "reference_offset_s": self.request.reference_offset_s,
@@ -817,6 +820,16 @@ def calibration(settings: Any, evaluation: Evaluation) -> dict[str, Any]:
         advice = "not to be used: the two do not agree, so that the path's shape is wrong, not only its scale"
     sentence = f"{key} = {fit:.6g} by least squares, {ratio:.6g} by path length; {advice}"
     return found | {"sentence": sentence}
+
+
+def clock_values(options: ReadOptions) -> dict[str, Any]:
+    """The clocks and offsets that were asked for, as RUN.toml keeps them; nothing where none was."""
+    values: dict[str, Any] = {}
+    if options.clocks:
+        values["clocks"] = [f"{topic}={clock}" for topic, clock in options.clocks]
+    if options.offsets_ns:
+        values["offsets_ms"] = [f"{topic}={ns / 1e6:.6f}" for topic, ns in options.offsets_ns]
+    return values
 
 
 def versions() -> dict[str, str]:
