@@ -43,6 +43,7 @@ if TYPE_CHECKING:
     from workbench.reproduce.plans import Reproduced
     from workbench.reproduce.ranging.results import Results as RangeResults
     from workbench.session import Outcome, Request
+    from workbench.sync import Pair
 
 
 app = typer.Typer(
@@ -611,6 +612,91 @@ def _has_display() -> bool:
     if sys.platform != "linux":
         return True
     return bool(os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+# ----------------------------------------------------------------------------------- sync
+
+
+@app.command(
+    short_help="How far the clocks of cameras, IMUs and odometers are apart.",
+    epilog=examples(
+        "workbench sync mission.bag",
+        "workbench sync mission.bag --image /camera/image_raw --with /imu --picture sync.png",
+        "workbench replay mission.bag --offset /camera/image_raw=-31.5",
+    ),
+)
+def sync(
+    path: RecordingPath,
+    images: Annotated[
+        list[str] | None, typer.Option("--image", metavar="TOPIC", help="Images [all]; repeatable.")
+    ] = None,
+    sensors: Annotated[
+        list[str] | None, typer.Option("--with", metavar="TOPIC", help="IMU or odometry [all]; repeatable.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option("--from", metavar="T", help="Begin: seconds after the first frame, ns, or ISO 8601.")
+    ] = None,
+    stop: Annotated[str | None, typer.Option("--to", metavar="T", help="End (excluded), likewise.")] = None,
+    max_offset: Annotated[float, typer.Option(metavar="S", help="How far the clocks may be apart.")] = 1.0,
+    picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the correlations.")] = None,
+    clocks: Clocks = None,
+    offsets: Offsets = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell by how much the times of each camera are to be moved to fit each IMU and odometer, and how surely.
+
+    The turn of the whole image is held against rates of turn, the way of the image against speeds. It takes motion that
+    changes: turns, or starts and stops. Exit status 3 where no offset could be told.
+    """
+    from readers.streams import StreamError
+    from workbench.session import Progress, open_any
+    from workbench.sync import draw
+    from workbench.sync import sync as estimated
+
+    if not 0 < max_offset < float("inf"):
+        raise StreamError(f"--max-offset {max_offset:g}: give a positive number of seconds")
+    with open_any(path, _options(None, None, "auto", None, clocks, offsets)) as recording, Bar("sync") as bar:
+        pairs = estimated(
+            recording,
+            images=images or (),
+            sensors=sensors or (),
+            start=start,
+            stop=stop,
+            max_offset_s=max_offset,
+            on_frame=lambda done, total: bar(Progress(done, None if total < 0 else total, 0)),
+        )
+    if picture is not None:
+        draw(pairs, picture)
+    if as_json:
+        print_json({"pairs": [_pair_values(pair) for pair in pairs]})
+    else:
+        for pair in pairs:
+            told = pair.offset
+            print(f"{shown(pair.camera)} and {shown(pair.sensor)}: ", end="")
+            if told.determined:
+                print(
+                    f"{told.offset_ns / 1e6:+.2f} ms (1σ {1e3 * told.sigma_s:.2f} ms) are to be added to the camera's "
+                    f"times, by {pair.signals} (correlation {told.correlation:.3f}): {shown(pair.option)}"
+                )
+            else:
+                print(told.reason)
+    raise typer.Exit(0 if any(pair.offset.determined for pair in pairs) else IN_PART)
+
+
+def _pair_values(pair: Pair) -> dict[str, Any]:
+    told = pair.offset
+    return {
+        "camera": pair.camera,
+        "sensor": pair.sensor,
+        "signals": pair.signals,
+        "determined": told.determined,
+        "reason": told.reason,
+        "offset_ms": told.offset_ns / 1e6 if told.determined else None,
+        "sigma_ms": 1e3 * told.sigma_s,
+        "correlation": told.correlation,
+        "scale": told.scale,
+        "option": pair.option,
+    }
 
 
 # --------------------------------------------------------------------------------- verify
