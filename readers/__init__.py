@@ -12,7 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from readers.streams import ReadOptions, Recording, RecordingError, StreamError
+from readers.streams import ReadOptions, Recording, RecordingError, WorkbenchError
 
 if TYPE_CHECKING:
     from tempfile import TemporaryDirectory
@@ -54,7 +54,7 @@ def open_recording(path: Path | str, options: ReadOptions = ReadOptions()) -> Re
         recording = _open(path, options)
         try:
             return adjusted(recording, options)
-        except StreamError:
+        except WorkbenchError:
             recording.close()
             raise
     except FileNotFoundError as error:

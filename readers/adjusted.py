@@ -6,40 +6,104 @@ other recording they are applied here. Cameras from a file replace the recording
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
+import itertools
 from collections.abc import Iterator, Mapping, Sequence
 
+from readers.camera_files import plain_topic, read_camera, read_cameras, scaled
 from readers.clock import merge
 from readers.log_recording import LogRecording
 from readers.streams import (
     Camera,
+    CameraFile,
     Clock,
     Damage,
+    ImageError,
+    ImageSample,
     Landmark,
     ReadOptions,
     Recording,
     Sample,
     StreamError,
     StreamInfo,
+    StreamKind,
 )
+
+FIRST_IMAGES = 20
 
 
 def adjusted(recording: Recording, options: ReadOptions) -> Recording:
-    """The recording with the clocks and offsets of the options; itself where nothing is asked for.
+    """The recording with the clocks, offsets and cameras of the options; itself where nothing is asked for.
 
     Raises:
         StreamError: a stream that is named is not there, or has no such clock.
+        RecordingError: the file of a camera cannot be used.
     """
-    if not (options.clocks or options.offsets_ns):
-        return recording
     known = {topic_of(info) for info in recording.streams}
     for topic in [*dict(options.clocks), *dict(options.offsets_ns)]:
         if topic not in known:
             there = ", ".join(sorted(known)) or "none"
-            raise StreamError(
-                f"{recording.path}: no stream named {topic!r} whose times could be set; there are: {there}"
-            )
-    return recording if isinstance(recording, LogRecording) else Adjusted(recording, options)
+            raise StreamError(f"{recording.path}: no stream {topic!r} to set the times of; there are: {there}")
+    cameras, notes = _cameras(recording, options)
+    clocked = bool(options.clocks or options.offsets_ns) and not isinstance(recording, LogRecording)
+    if not (clocked or cameras):
+        return recording
+    return Adjusted(recording, options, cameras=cameras, notes=notes)
+
+
+def _cameras(recording: Recording, options: ReadOptions) -> tuple[dict[str, Camera], list[str]]:
+    """The cameras that take the place of the recording's own, by image stream, and what is to be said of them."""
+    images = [info.name for info in recording.of_kind(StreamKind.IMAGE)]
+    found: dict[str, Camera] = {}
+    notes: list[str] = []
+    for file in options.cameras:
+        for topic in _topics_of(recording, file, images):
+            calibration = read_camera(file.path, name=file.name, topic=topic)
+            found[topic] = calibration.camera
+            notes += calibration.notes
+    if options.scale_cameras:
+        for topic, camera in (recording.cameras | found).items():
+            size = _image_size(recording, topic)
+            if camera.calibrated and size is not None and size != (camera.width_px, camera.height_px):
+                try:
+                    found[topic] = scaled(camera, *size)
+                except ValueError as error:
+                    raise StreamError(f"{recording.path}: {topic} cannot be scaled to: {error}") from error
+                old = f"{camera.width_px} x {camera.height_px}"
+                notes.append(f"{topic}: its calibration for {old} px is scaled to {size[0]} x {size[1]} px, as asked.")
+    return found, notes
+
+
+def _topics_of(recording: Recording, file: CameraFile, images: list[str]) -> list[str]:
+    """The streams of images that the camera of a file is for."""
+    if file.topic:
+        if file.topic not in images:
+            there = ", ".join(images) or "none"
+            raise StreamError(f"{recording.path}: no images named {file.topic!r} for {file.path}; there are: {there}")
+        return [file.topic]
+    if len(images) == 1:
+        return images
+    named = {plain_topic(c.topic) for c in read_cameras(file.path) if c.topic and file.name in ("", c.name, c.topic)}
+    matching = [topic for topic in images if plain_topic(topic) in named]
+    if not matching:
+        there = ", ".join(images) or "none"
+        raise StreamError(
+            f"{recording.path}: which images is {file.path} for? Write --camera TOPIC={file.path}; there are: {there}"
+        )
+    return matching
+
+
+def _image_size(recording: Recording, topic: str) -> tuple[int, int] | None:
+    """Width and height of the first image of a stream, None where none can be told."""
+    for sample in itertools.islice(recording.read([topic]), FIRST_IMAGES):
+        if isinstance(sample, ImageSample):
+            if sample.width_px:
+                return sample.width_px, sample.height_px
+            with contextlib.suppress(ImageError):
+                height, width = sample.grey().shape
+                return width, height
+    return None
 
 
 def topic_of(info: StreamInfo) -> str:

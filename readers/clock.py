@@ -218,6 +218,9 @@ def _size_facts(recording: Recording, audits: Mapping[str, StreamAudit]) -> Iter
             for name, camera in cameras
             if name in images
         ]
+    for name, camera in recording.cameras.items():
+        if not camera.calibrated:
+            yield Fact(stream=name, code="calibration_empty", count=1, sentence="the calibration has no focal length")
     for name, size, against in listed:
         if against and size != (0, 0) and size not in against:
             found = " or ".join(f"{width} x {height} px" for width, height in sorted(against))

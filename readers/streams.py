@@ -274,7 +274,7 @@ class Camera:
     P [3, 4] in px; a matrix that the log does not have is NaN. `body_t_camera` [4, 4] is the transform that
     maps points of the camera (x right, y down, z ahead) into the body, whose axes are those of the recording's own
     odometry, IMU and poses; NaN where unknown.
-    A size of 0 x 0 px is unknown.
+    A size of 0 x 0 px is unknown. `source` says where it comes from, empty for the recording itself.
     """
 
     width_px: int
@@ -286,6 +286,7 @@ class Camera:
     projection: FloatArray
     frame: str = ""
     body_t_camera: FloatArray = field(default_factory=unknown_transform, repr=False)
+    source: str = field(default="", compare=False)
 
     @property
     def calibrated(self) -> bool:
@@ -312,6 +313,19 @@ class Problem(Sample):
     frame: int = -1
 
 
+@dataclass(frozen=True, slots=True)
+class CameraFile:
+    """A file with the calibration of a camera.
+
+    `topic` is the stream of images that it is for, empty for the only one or those that the file names; `name` the
+    camera in the file, empty for the only one or that of the topic.
+    """
+
+    path: Path
+    topic: str = ""
+    name: str = ""
+
+
 class Clock(enum.StrEnum):
     """Whose time a sample carries: the sensor's (header stamp), the recorder's (log), or the sender's (publish)."""
 
@@ -334,7 +348,8 @@ class ReadOptions:
     frames' times, in `times_unit` (``s``, ``ms``, ``us``, ``ns`` or ``auto``); `pose_frames` pairs
     ``parent, child`` whose transforms in ``/tf`` become pose streams (all pairs found if empty). `clocks` are pairs of
     a topic and the `Clock` that its samples' times come from, ``header`` where none is named; `offsets_ns` pairs of a
-    topic and what is added to the times of its samples.
+    topic and what is added to the times of its samples. `cameras` are the files of calibrations that take the place of
+    the recording's own; `scale_cameras` has calibrations of another image size scaled to the images.
     """
 
     rate_hz: float | None = None
@@ -343,6 +358,8 @@ class ReadOptions:
     pose_frames: tuple[tuple[str, str], ...] = ()
     clocks: tuple[tuple[str, Clock], ...] = ()
     offsets_ns: tuple[tuple[str, int], ...] = ()
+    cameras: tuple[CameraFile, ...] = ()
+    scale_cameras: bool = False
 
     def clock_of(self, topic: str) -> Clock:
         """The clock of a topic."""

@@ -37,7 +37,7 @@ from workbench.terminal import (
 
 if TYPE_CHECKING:
     from pipelines.simulation.mission import SimulatedMission
-    from readers.streams import Camera, Clock, ReadOptions, Recording, StreamInfo
+    from readers.streams import Camera, CameraFile, Clock, ReadOptions, Recording, StreamInfo
     from workbench.reproduce import report as reports_a
     from workbench.reproduce.judged import Statement
     from workbench.reproduce.plans import Reproduced
@@ -87,6 +87,17 @@ Offsets = Annotated[
     list[str] | None,
     typer.Option("--offset", metavar="TOPIC=MS", help="Milliseconds to add to the times of a topic; repeatable."),
 ]
+Cameras = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--camera",
+        metavar="[TOPIC=]FILE[#NAME]",
+        help="Calibration in place of the recording's: YAML of ROS, Kalibr or OpenCV; repeatable.",
+    ),
+]
+ScaleCamera = Annotated[
+    bool, typer.Option("--scale-camera", help="Scale a calibration for another image size to the images.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 
 
@@ -120,11 +131,13 @@ def inspect(
     tf: TimeFrames = None,
     clocks: Clocks = None,
     offsets: Offsets = None,
+    cameras: Cameras = None,
+    scale_camera: ScaleCamera = False,
 ) -> None:
     """Show what is in a recording: streams, cameras, damage, and what is odd about its clocks."""
     from workbench.session import open_any
 
-    with open_any(path, _options(rate, times, times_unit, tf, clocks, offsets)) as recording:
+    with open_any(path, _options(rate, times, times_unit, tf, clocks, offsets, cameras, scale_camera)) as recording:
         facts, clocks_found = ([], {}) if quick else _survey(recording)
         values = _recording_values(recording, facts) | {"clocks": clocks_found}
         if as_json:
@@ -195,6 +208,7 @@ def _camera_values(camera: Camera) -> dict[str, Any]:
         "distortion_model": camera.distortion_model,
         "distortion": camera.distortion.tolist(),
         "frame": camera.frame,
+        "source": camera.source,
         "calibrated": camera.calibrated,
     }
 
@@ -259,7 +273,9 @@ def _camera_text(camera: Camera) -> str:
     if not camera.calibrated:
         return f"{size}, not calibrated"
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
-    return f"{size}, f {fx:.6g} {fy:.6g}, centre {cx:.6g} {cy:.6g}, distortion {shown(camera.distortion_model)}"
+    source = f", of {shown(camera.source)}" if camera.source else ""
+    lens = shown(camera.distortion_model)
+    return f"{size}, f {fx:.6g} {fy:.6g}, centre {cx:.6g} {cy:.6g}, distortion {lens}{source}"
 
 
 # --------------------------------------------------------------------------------- replay
@@ -334,6 +350,8 @@ def replay(
     tf: TimeFrames = None,
     clocks: Clocks = None,
     offsets: Offsets = None,
+    cameras: Cameras = None,
+    scale_camera: ScaleCamera = False,
     as_json: AsJson = False,
 ) -> None:
     """Replay a recording through an estimator; write all it computed, and a summary.
@@ -363,7 +381,7 @@ def replay(
         reference=reference,
         reference_offset_s=reference_offset,
         height=height,
-        options=_options(rate, times, times_unit, tf, clocks, offsets),
+        options=_options(rate, times, times_unit, tf, clocks, offsets, cameras, scale_camera),
         calibrate=calibrate,
         smooth=smooth,
         raw_images=_one_of(raw_images, ("png", "raw"), "--raw-images"),
@@ -989,6 +1007,8 @@ def _options(
     frames: Sequence[str] | None,
     clocks: Sequence[str] | None = None,
     offsets: Sequence[str] | None = None,
+    cameras: Sequence[str] | None = None,
+    scale_camera: bool = False,
 ) -> ReadOptions:
     from readers.streams import ReadOptions, StreamError
 
@@ -1007,7 +1027,20 @@ def _options(
         pose_frames=tuple(pairs),
         clocks=_clocks(clocks or ()),
         offsets_ns=_offsets(offsets or ()),
+        cameras=tuple(map(_camera_file, cameras or ())),
+        scale_cameras=scale_camera,
     )
+
+
+def _camera_file(text: str) -> CameraFile:
+    """A file of a camera, with the stream that it is for before it and the camera's name behind it."""
+    from readers.streams import CameraFile
+
+    if Path(text).is_file():
+        return CameraFile(Path(text))
+    topic, _, rest = text.rpartition("=")
+    file, mark, name = rest.rpartition("#")
+    return CameraFile(Path(file if mark else rest), topic, name if mark else "")
 
 
 def _clocks(texts: Sequence[str]) -> tuple[tuple[str, Clock], ...]:

@@ -373,18 +373,39 @@ def _focal(settings: Any, camera: Camera | None, size_px: tuple[int, int]) -> tu
     """The focal length, what it comes from, and what to look out for."""
     if settings.focal_px is not None:
         return settings.focal_px, f"focal length {settings.focal_px:g} px, as given", []
-    if camera is None or not camera.calibrated:
+    if camera is None:
         return None, "", []
+    if not camera.calibrated:
+        return (
+            None,
+            "",
+            ["the calibration is empty (K has no focal length): give --camera FILE or focal_px"],
+        )
     made_for = (camera.width_px, camera.height_px)
     if made_for not in (size_px, (0, 0)):
         note = (
             f"the calibration is for {made_for[0]} x {made_for[1]} px, but the images are {size_px[0]} x "
-            f"{size_px[1]} px: it is not used; give focal_px"
+            f"{size_px[1]} px: it is not used; give focal_px, or --scale-camera if the images were resized"
         )
         return None, "", [note]
-    notes = ["lens distortion is not removed from the images"] if np.any(camera.distortion) else []
+    notes = [camera_sentence(camera)]
+    notes += ["lens distortion is not removed from the images"] if np.any(camera.distortion) else []
     focal = float(camera.matrix[0, 0])
-    return focal, f"focal length {focal:.6g} px of the log's calibration", notes
+    return focal, f"focal length {focal:.6g} px of {source_of(camera)}", notes
+
+
+def source_of(camera: Camera) -> str:
+    """Where a camera comes from."""
+    return camera.source or "the log's calibration"
+
+
+def camera_sentence(camera: Camera) -> str:
+    """The model of a camera and where it comes from."""
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    size = f"{camera.width_px} x {camera.height_px} px, " if camera.width_px else ""
+    lens = ", ".join(f"{k:.6g}" for k in camera.distortion)
+    bent = f"distortion {camera.distortion_model} ({lens})" if np.any(camera.distortion) else "no distortion"
+    return f"camera: {size}f {fx:.6g} {fy:.6g}, centre {cx:.6g} {cy:.6g}, {bent}, of {source_of(camera)}"
 
 
 def _height(settings: Any, recording: Recording, stream: str) -> tuple[dict[str, Any], str]:

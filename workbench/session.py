@@ -758,7 +758,7 @@ class _Session:
         return {
             "format": FORMAT,
             "digest": self.digest,
-            **clock_values(self.request.options),
+            **{k: v for k, v in option_values(self.request.options).items() if k in ("clocks", "offsets_ms")},
             "image_stream": self.chosen.shown or self.chosen.frames,
             "reference_stream": self.chosen.reference.stream,
             "raw_images": self.request.raw_images,
@@ -777,7 +777,7 @@ class _Session:
                 "preset": self.preset,
                 "recording": str(self.request.path),
                 "digest": self.digest,
-                **clock_values(self.request.options),
+                **option_values(self.request.options),
                 "image_stream": self.chosen.frames,
                 "reference_stream": self.chosen.reference.stream,
                 "reference_offset_s": self.request.reference_offset_s,
@@ -822,13 +822,17 @@ def calibration(settings: Any, evaluation: Evaluation) -> dict[str, Any]:
     return found | {"sentence": sentence}
 
 
-def clock_values(options: ReadOptions) -> dict[str, Any]:
-    """The clocks and offsets that were asked for, as RUN.toml keeps them; nothing where none was."""
+def option_values(options: ReadOptions) -> dict[str, Any]:
+    """The clocks, offsets and cameras that were asked for, as RUN.toml keeps them; nothing where none was."""
     values: dict[str, Any] = {}
     if options.clocks:
         values["clocks"] = [f"{topic}={clock}" for topic, clock in options.clocks]
     if options.offsets_ns:
         values["offsets_ms"] = [f"{topic}={ns / 1e6:.6f}" for topic, ns in options.offsets_ns]
+    if options.cameras:
+        values["cameras"] = [f"{c.topic}={c.path}#{c.name}" for c in options.cameras]
+    if options.scale_cameras:
+        values["scale_cameras"] = True
     return values
 
 
