@@ -196,6 +196,7 @@ class StreamAudit:
             "zero_quaternion": "quaternions are all zero and were read as unknown",
             "quaternion_norm": "quaternions are not of unit norm and were scaled",
             "identity_orientation": "orientations are the identity with zero covariance, as if never measured; kept",
+            "spare_bytes": "images hold more bytes than their rows and step make; the rest was left out",
             "size_change": "images differ in size from the one before",
             "gap": f"gaps are longer than {GAP_FACTOR:g} usual steps, the longest {self.longest_gap_ns / 1e9:.3f} s",
         }

@@ -18,7 +18,7 @@ import numpy as np
 
 from readers.clock import sane_stamp
 from readers.decoding import MessageError
-from readers.images import image_header
+from readers.images import RAW_FORMATS, image_header, is_depth
 from readers.streams import (
     UNKNOWN_COV3,
     UNKNOWN_COV6,
@@ -204,6 +204,9 @@ def image(message: Any, arrival: Arrival) -> ImageSample:
     height, step = int(message.height), int(message.step)
     if height * step > len(payload):
         raise MessageError(f"the image states {height} rows of {step} bytes and holds {len(payload)} bytes")
+    form = RAW_FORMATS.get(str(message.encoding).lower())
+    if step and form is not None and len(payload) > (height * form.rows + 1) // 2 * step:
+        arrival.oddities.append("spare_bytes")
     return ImageSample(
         **arrival.stamps(header_stamp(message)),
         encoding=str(message.encoding),
@@ -218,15 +221,14 @@ def image(message: Any, arrival: Arrival) -> ImageSample:
 
 def compressed_image(message: Any, arrival: Arrival) -> ImageSample:
     """sensor_msgs/CompressedImage and foxglove.CompressedImage."""
-    if "compressedDepth" in message.format:
-        raise UnsupportedError(f"depth images of the format {message.format!r} (compressedDepth) are not supported")
     payload = _bytes(message.data)
     if not payload:
         raise MessageError("the image holds no bytes")
-    encoding, width, height = image_header(payload)
+    stated = str(message.format)
+    encoding, width, height = (stated, 0, 0) if is_depth(stated) else image_header(payload)
     return ImageSample(
         **arrival.stamps(header_stamp(message)),
-        encoding=encoding or stated_format(message.format),
+        encoding=encoding or stated_format(stated),
         payload=payload,
         width_px=width,
         height_px=height,

@@ -145,6 +145,16 @@ class ImageSample(Sample):
 
         return decode_colour(self)
 
+    def depth(self) -> NDArray[np.float32]:
+        """Decode a depth image to metres, shape [height, width], NaN where nothing was measured.
+
+        Raises:
+            ImageError: the image is damaged or holds no distances.
+        """
+        from readers.images import decode_depth
+
+        return decode_depth(self)
+
 
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ImuSample(Sample):

@@ -275,7 +275,9 @@ def test_the_scale_comes_from_height_and_calibration(toys: Path, shell: Shell) -
     values = shell.replay("walk-camera.log", "--json").json
     assert values["unit"] == "m"
     assert values["scale"] == "height of /range over focal length 200 px of the log's calibration"
-    assert values["notes"] == ["lens distortion is not removed from the images"]
+    model = "4 x 3 px, f 200 200, centre 2 1.5, distortion plumb_bob (0.1, 0, 0, 0, 0)"
+    distorted = "lens distortion is not removed from the images"
+    assert values["notes"] == [f"camera: {model}, of the log's calibration", distorted]
     assert values["path_length"] == pytest.approx(3.9)
 
 
@@ -551,7 +553,7 @@ def test_every_help_has_an_example(shell: Shell, command: list[str]) -> None:
 
 def test_inspect_lists_streams_oddities_and_damage(toys: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     fact = Fact(stream="/imu", code="gap", count=2, sentence="2 gaps")
-    monkeypatch.setattr(readers.clock, "survey", lambda recording, progress=None: (fact,), raising=False)
+    monkeypatch.setattr(readers.clock, "examine", lambda recording: readers.clock.Survey((fact,), {}))
     Path("walk-damaged-camera.log").touch()
     said = shell("inspect", "walk-damaged-camera.log")
     assert said.status == 3

@@ -41,6 +41,8 @@ from readers.streams import (
 from workbench.settings import Layer, Resolved, validated
 
 NONE = "none"
+DEPTH = "/compressedDepth"
+"""How topics of compressed depth images end: they are images that no picture is in."""
 SECOND_NS = 1_000_000_000
 MARGIN_NS = 2 * SECOND_NS
 EDGE_BYTES = 1 << 20
@@ -152,8 +154,9 @@ def choose_images(recording: Recording, wanted: str | None) -> str:
     if wanted is not None:
         return of_kind(recording, wanted, (StreamKind.IMAGE,), "--image")
     found = recording.of_kind(StreamKind.IMAGE)
-    if len(found) == 1:
-        return found[0].name
+    pictures = [info for info in found if not info.name.endswith(DEPTH)]
+    if len(pictures) == 1:
+        return pictures[0].name
     if found:
         raise StreamError(f"{recording.path}: several image streams: {names(found)}; choose one with --image")
     raise StreamError(f"{recording.path}: no stream of images that can be read; the streams are: {kinds(recording)}")
