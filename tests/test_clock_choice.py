@@ -1,12 +1,12 @@
 """Which clock a sample's time comes from, offsets, and what is odd about clocks."""
 
 import json
-from collections.abc import Collection, Iterator
+from collections.abc import Collection, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
 import pytest
-from made_logs import MS, ROS2, START_NS, drive, raw_ros, write_mcap
+from made_logs import MS, ROS2, START_NS, Maker, drive, raw_ros, write_mcap
 
 from readers import open_recording
 from readers.clock import SECOND_NS, StreamAudit, examine
@@ -14,7 +14,7 @@ from readers.log_recording import LogRecording
 from readers.message_log import Channel, Message
 from readers.streams import Clock, ReadOptions, Sample, ScalarSample, StreamError
 from workbench.cli import main
-from workbench.session import open_any
+from workbench.session import Request, open_any, run
 
 SENT_LATE = 3 * MS
 
@@ -125,6 +125,29 @@ def test_inspect_tells_how_late_log_time_is(log: Path, capsys: pytest.CaptureFix
     assert "/imu: +2 ms are added to its times, as asked." in told["notes"]
     assert main(["inspect", str(log)]) == 0
     assert "45.000" in capsys.readouterr().out
+
+
+def test_a_replay_warns_of_clocks_before_it_begins(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    entries = [e for e in drive(ROS2, 1.0) if e.topic == "/cam/image_raw"]
+    jumped = [
+        e._replace(message=Maker(ROS2).image(e.log_ns + (7000 if k >= 5 else 0) * MS)) for k, e in enumerate(entries)
+    ]
+    path = write_mcap(tmp_path / "a.mcap", raw_ros(jumped, 2), "ros2")
+    warned: list[str] = []
+
+    class StopError(Exception):
+        pass
+
+    def warn(texts: Sequence[str]) -> None:
+        warned.extend(texts)
+        raise StopError
+
+    with pytest.raises(StopError):
+        run(Request(path=path, out=tmp_path / "out"), on_warnings=warn)
+    assert not (tmp_path / "out").exists()
+    (jump,) = [text for text in warned if "jump" in text]
+    assert jump.startswith("/cam/image_raw, first 10 s: 1 times the header stamps jump")
+    assert "+7.000 s" in jump
 
 
 # ------------------------------------------------------------------------------- oddities

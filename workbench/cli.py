@@ -402,7 +402,13 @@ def _replay(request: Request, recording: Recording | None = None) -> Outcome:
     from workbench.session import run
 
     with Bar(request.name or request.preset or request.estimator) as bar:
-        return run(request, recording=recording, on_progress=bar)
+        return run(request, recording=recording, on_progress=bar, on_warnings=_warn)
+
+
+def _warn(texts: Sequence[str]) -> None:
+    """Tell what is odd about the clocks before the estimator runs."""
+    for text in texts:
+        print(f"warning: {shown(text)}", file=sys.stderr, flush=True)
 
 
 def _status(outcome: Outcome) -> int:

@@ -20,6 +20,7 @@ import numpy as np
 
 from pipelines.evaluation import Trajectory, associate
 from pipelines.geometry import local_enu
+from readers.clock import StreamAudit
 from readers.streams import (
     UNKNOWN_COV6,
     UNKNOWN_QUAT,
@@ -135,6 +136,27 @@ def _no_frame(recording: Recording, stream: str) -> StreamError:
     info = recording.stream(stream)
     span = f"from {info.first_ns} to {info.last_ns} ns" if info.first_ns >= 0 else "at no time"
     return StreamError(f"{recording.path}: {stream} has no frame in this window; its messages lie {span}")
+
+
+LOOK_NS = 10 * SECOND_NS
+CLOCK_FACTS = frozenset(
+    ("clock_jump", "duplicate_stamp", "foreign_publish_time", "foreign_stamp", "frozen_stamp", "gap", "out_of_order")
+) | {"stamp_rollover", "zero_stamp"}
+
+
+def clock_warnings(recording: Recording, streams: Sequence[str], first_ns: int, stop_ns: int | None) -> list[str]:
+    """What is odd about the clocks of some streams in the first seconds of a window, one sentence each.
+
+    A simulated mission is not looked at: its oddities are its own, and looking renders it.
+    """
+    if recording.identity:
+        return []
+    last_ns = first_ns + LOOK_NS if stop_ns is None else min(stop_ns, first_ns + LOOK_NS)
+    audits = {name: StreamAudit(name) for name in streams}
+    for sample in while_readable(recording.read(list(streams), first_ns, last_ns)):
+        audits[sample.stream].add(sample)
+    facts = [fact for audit in audits.values() for fact in audit.facts() if fact.code in CLOCK_FACTS]
+    return [f"{fact.stream}, first {LOOK_NS // SECOND_NS} s: {fact.sentence}" for fact in facts]
 
 
 # -------------------------------------------------------------------------------- streams

@@ -216,6 +216,7 @@ def run(
     *,
     recording: Recording | None = None,
     on_progress: Callable[[Progress], None] | None = None,
+    on_warnings: Callable[[Sequence[str]], None] | None = None,
     writers: Writers | None = None,
 ) -> Outcome:
     """Replay a recording and write its run folder.
@@ -224,6 +225,7 @@ def run(
         request: what is asked for.
         recording: the recording, where it is no file (a simulated mission); else `request.path` is opened.
         on_progress: called after every frame.
+        on_warnings: called before the first frame with what is odd about the clocks in its first seconds, if anything.
         writers: the classes that write the files; those of `workbench.rrd` by default.
 
     Raises:
@@ -240,6 +242,8 @@ def run(
         raise SettingsError(f"--stride {request.stride}: must be 1 or more")
     with recording or open_any(request.path, request.options) as opened:
         session = _prepare(request, opened, estimator, resolved, name, preset)
+        if on_warnings is not None and (warnings := session.clock_warnings()):
+            on_warnings(warnings)
         with Interrupt() as interrupt:
             return session.replay(writers or rerun_writers(), interrupt, on_progress)
 
@@ -401,20 +405,20 @@ class _Audited(Recording):
 
     def __init__(self, inner: Recording) -> None:
         self.path, self.format, self.notes = inner.path, inner.format, inner.notes
-        self._inner = inner
+        self.inner = inner
         self.audits: dict[str, StreamAudit] = {}
 
     @property
     def streams(self) -> tuple[StreamInfo, ...]:
-        return self._inner.streams
+        return self.inner.streams
 
     def read(
         self, streams: Sequence[str] | None = None, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Sample]:
-        return self._audited(self._inner.read(streams, start_ns, stop_ns))
+        return self._audited(self.inner.read(streams, start_ns, stop_ns))
 
     def arrivals(self, streams: Sequence[str] | None = None) -> Iterator[Sample]:
-        return self._audited(self._inner.arrivals(streams))
+        return self._audited(self.inner.arrivals(streams))
 
     def _audited(self, samples: Iterator[Sample]) -> Iterator[Sample]:
         for sample in samples:
@@ -424,7 +428,7 @@ class _Audited(Recording):
             yield sample
 
     def count_before(self, stream: str, t_ns: int) -> int:
-        return self._inner.count_before(stream, t_ns)
+        return self.inner.count_before(stream, t_ns)
 
     def facts(self) -> list[str]:
         """The oddities of what was read, one sentence each."""
@@ -432,7 +436,7 @@ class _Audited(Recording):
 
     def damage_lines(self) -> list[str]:
         """What of the file was found damaged so far."""
-        return [str(damage) for damage in self._inner.damage]
+        return [str(damage) for damage in self.inner.damage]
 
 
 class Account(Protocol):
@@ -556,6 +560,12 @@ class _Session:
     digest: str
 
     # ---- the loop
+
+    def clock_warnings(self) -> list[str]:
+        """What is odd about the clocks of the streams that are used, in the first seconds of the window."""
+        recording, chosen = self.recording.inner, self.chosen
+        first_ns = inputs.first_time(recording, chosen.frames, chosen.start_ns, chosen.stop_ns)
+        return inputs.clock_warnings(recording, [chosen.frames, *chosen.others], first_ns, chosen.stop_ns)
 
     def replay(self, writers: Writers, interrupt: Interrupt, on_progress: Callable[[Progress], None] | None) -> Outcome:
         """Replay, judge and write; RUN.toml says how it ended."""
