@@ -23,6 +23,10 @@ LEAST_CORRELATION = 0.5
 """Below this the speeds are not those of one motion."""
 HALF_WINDOW_S = 0.5
 """Half the time over which speeds are taken: longer than the noise of positions, shorter than changes of speed."""
+LEAST_WINDOWS = 20
+"""Signals of fewer windows go together by chance."""
+RIVAL_MARGIN = 0.02
+"""A peak of the correlation within this of the best one is as good."""
 LEAST_HALF_WINDOW_S = 0.1
 """The same of signals."""
 COARSE = 4
@@ -121,6 +125,9 @@ def signal_offset(
     if min(len(first_ns), len(second_ns)) < 3:
         return _unknown("one of the signals has fewer than 3 values")
     found = correlations(first_ns, first, second_ns, second, max_offset_s=max_offset_s, half_window_s=half_window_s)
+    least_s = LEAST_WINDOWS * 2 * found.moved.half
+    if min(part.last - part.first for part in (found.moved, found.truth)) < least_s:
+        return _unknown(f"there is too little of them: {least_s:.3g} s or more are needed")
     if not np.isfinite(found.correlation).any():
         return _unknown("the two signals have too little time in common, or one of them does not vary")
     best = int(np.nanargmax(np.abs(found.correlation)))
@@ -128,8 +135,20 @@ def signal_offset(
         return _unknown(f"the signals do not go together: their correlation is {found.correlation[best]:.2f} at best")
     if best in (0, len(found.lag_s) - 1):
         return _unknown("the best offset lies at the border of those that are looked at")
+    if (rival := _rival(np.abs(found.correlation), best)) is not None:
+        return _unknown(
+            f"the motion repeats itself: {found.lag_s[best]:.3f} s and {found.lag_s[rival]:.3f} s fit alike"
+        )
     t = np.arange(found.moved.first, found.moved.last, found.step_s)
     return _refined(found.moved, found.truth, t, float(found.lag_s[best]))
+
+
+def _rival(strength: Floats, best: int) -> int | None:
+    """The place of another peak of the correlation [k] that is as good as the best one, None if there is none."""
+    inner = strength[1:-1]
+    peaks = 1 + np.flatnonzero((inner > strength[:-2]) & (inner >= strength[2:]))
+    rivals = [int(k) for k in peaks if abs(k - best) > COARSE and strength[k] > strength[best] - RIVAL_MARGIN]
+    return max(rivals, key=lambda k: strength[k]) if rivals else None
 
 
 class Correlations(NamedTuple):

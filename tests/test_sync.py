@@ -155,6 +155,16 @@ def test_motions_that_have_nothing_in_common_tell_nothing(tmp_path: Path) -> Non
         draw([found], tmp_path / "a.png")
 
 
+def test_a_motion_that_repeats_itself_or_is_short_tells_nothing() -> None:
+    t_ns = np.arange(0, 8 * SECOND, SECOND // 50)
+    angle = np.sin(2 * np.pi * t_ns / 1e9 / 0.7)
+    periodic = signal_offset(t_ns, angle, t_ns, angle)
+    assert not periodic.determined
+    assert "repeats itself" in periodic.reason
+    short = signal_offset(t_ns[:60], angle[:60], t_ns, angle, max_offset_s=0.2)
+    assert "too little of them: 4 s or more" in short.reason
+
+
 def test_the_correlations_are_drawn(tmp_path: Path) -> None:
     draw(sync(Mission(weaving, 0.03, seconds=6.0)), tmp_path / "a.png")
     picture = cv2.imread(str(tmp_path / "a.png"))
