@@ -100,7 +100,7 @@ class Topic:
             self.name,
             message.log_ns,
             self.trust_stamps,
-            published_ns=message.published_ns,
+            published_ns=message.publish_ns,
             clock=self.clock,
             offset_ns=self.offset_ns,
         )
@@ -203,7 +203,7 @@ class LogRecording(Recording):
                 decoded = topic.decoders[message.channel](message.data)
                 list(samples_of(topic.reader, decoded, Arrival(topic.name, message.log_ns)))
                 if topic.clock is Clock.PUBLISH:
-                    stamps.append((message.log_ns, message.published_ns))
+                    stamps.append((message.log_ns, message.publish_ns))
                 topic.frame = topic.frame or frame_of(decoded)
                 stamp = header_stamp(decoded)
                 if stamp is not None and topic.clock is Clock.HEADER:

@@ -55,12 +55,16 @@ class Channel:
 
 
 class Message(NamedTuple):
-    """One message as it was stored, with its log time in nanoseconds; publish time -1 where the container has none."""
+    """One message as it was stored, with its log time in nanoseconds.
+
+    `publish_ns` and `sequence` are -1 where the container does not keep them.
+    """
 
     log_ns: int
     channel: Channel
     data: Buffer
-    published_ns: int = -1
+    publish_ns: int = -1
+    sequence: int = -1
 
 
 class Opener(Protocol):

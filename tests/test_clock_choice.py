@@ -31,7 +31,7 @@ def published(monkeypatch: pytest.MonkeyPatch) -> None:
     stored = LogRecording._messages
 
     def messages(self: LogRecording, channels: Collection[Channel], *window: int | None) -> Iterator[Message]:
-        return (m._replace(published_ns=m.log_ns - SENT_LATE) for m in stored(self, channels, *window))
+        return (m._replace(publish_ns=m.log_ns - SENT_LATE) for m in stored(self, channels, *window))
 
     monkeypatch.setattr(LogRecording, "_messages", messages)
 
@@ -61,7 +61,7 @@ def test_a_topic_has_the_clock_that_was_chosen(log: Path, published: None) -> No
 
 def test_a_log_without_publish_times_says_that_log_time_is_used(log: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     stored = LogRecording._messages
-    monkeypatch.setattr(LogRecording, "_messages", lambda *args: (m._replace(published_ns=-1) for m in stored(*args)))
+    monkeypatch.setattr(LogRecording, "_messages", lambda *args: (m._replace(publish_ns=-1) for m in stored(*args)))
     with open_recording(log, ReadOptions(clocks=(("/imu", Clock.PUBLISH),))) as recording:
         assert "/imu: it has no publish times of the log's epoch; log time is used." in recording.notes
         samples = list(recording.read(["/imu"]))
