@@ -1,7 +1,7 @@
 """The loop: Recording + estimator → steps.
 
-The recording is read and the estimator runs in the caller's thread; images are decoded ahead in one other
-thread, in order, at most `decode_ahead` of them, so that memory is bounded and nothing depends on timing.
+The recording is read and the estimator runs in the caller's thread; images are decoded ahead in other threads, at most
+`decode_ahead` of them, and taken in order, so that memory is bounded and nothing depends on timing.
 
 Frames are images, pixel tracks or measured landmarks: the samples of one stream. They are numbered 0, 1, …
 within that stream of the whole recording, undecodable ones included. With a window, the frames before it are
@@ -69,7 +69,8 @@ def replay(
     stop_ns: int | None = None,
     stride: int = 1,
     latency: LatencyBuffer | None = None,
-    decode_ahead: int = 4,
+    decode_ahead: int = 8,
+    decode_threads: int = 2,
     on_progress: OnProgress | None = None,
     beside_streams: Sequence[str] = (),
     on_sample: OnSample | None = None,
@@ -79,7 +80,7 @@ def replay(
     The estimator gets each image as an `ImageSample` with the encoding ``mono8`` (``mono16`` for 16-bit
     images) whose payload is the decoded grey image, an image that cannot be decoded as a `Problem` of kind
     IMAGE, and other frames and the samples of `other_streams` as they are, all in the order of time. Closing
-    the iterator stops the decoding thread at once.
+    the iterator stops the decoding threads at once.
 
     Args:
         recording: where the samples come from.
@@ -92,17 +93,19 @@ def replay(
         stride: use every n-th frame of the window; the others are not decoded.
         latency: a buffer that sorts the samples by time; None: they come as the reader sorts them.
         decode_ahead: how many images are decoded ahead of the estimator.
+        decode_threads: by how many threads.
         on_progress: called after each step with the number of steps so far and the frame's time in ns.
         beside_streams: names of streams that only `on_sample` gets; with the state as it is by then.
         on_sample: called after each sample but those that are only shown, in the order in which they came.
 
     Raises:
-        ValueError: `stride` or `decode_ahead` is below 1.
+        ValueError: `stride`, `decode_ahead` or `decode_threads` is below 1.
         StreamError: a stream is not in the recording.
         RecordingError: nothing more of the file can be read; the steps before it were yielded.
     """
-    if stride < 1 or decode_ahead < 1:
-        raise ValueError(f"stride and decode_ahead must be 1 or more, not {stride} and {decode_ahead}")
+    if min(stride, decode_ahead, decode_threads) < 1:
+        given = f"{stride}, {decode_ahead} and {decode_threads}"
+        raise ValueError(f"stride, decode_ahead and decode_threads must be 1 or more, not {given}")
     shown = [shown_stream] if shown_stream and shown_stream != image_stream else []
     beside = [name for name in beside_streams if name not in (image_stream, *other_streams, *shown)]
     names = [image_stream, *other_streams, *shown, *beside]
@@ -114,7 +117,7 @@ def replay(
     else:
         samples = latency.through(_unsorted(recording, names, start_ns, stop_ns, latency.by_arrival), other_streams)
     chosen = _numbered(samples, image_stream, first, stride)
-    ahead = _decoded_ahead(chosen, decode_ahead, [*shown, *beside])
+    ahead = _decoded_ahead(chosen, decode_ahead, decode_threads, [*shown, *beside])
     steps = _steps(ahead, estimator, image_stream, shown, beside, on_sample)
     return _told(_with_shown(steps) if shown else steps, on_progress)
 
@@ -241,7 +244,7 @@ def _numbered(samples: Iterator[Sample], image_stream: str, first: int, stride: 
 
 
 def _decoded_ahead(
-    samples: Iterator[Sample], ahead: int, shown: Sequence[str] = ()
+    samples: Iterator[Sample], ahead: int, threads: int, shown: Sequence[str] = ()
 ) -> Generator[tuple[Sample, Sample]]:
     """Yield every sample with its decoded form, in order, with at most `ahead` images under way.
 
@@ -249,7 +252,7 @@ def _decoded_ahead(
     """
     waiting: deque[tuple[Sample, Future[Sample]]] = deque()
     images = 0
-    pool = ThreadPoolExecutor(1, thread_name_prefix="decode")
+    pool = ThreadPoolExecutor(threads, thread_name_prefix="decode")
     try:
         for sample, future in _submitted(samples, pool, shown):
             waiting.append((sample, future))

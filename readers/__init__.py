@@ -12,7 +12,7 @@ from pathlib import Path
 from types import MappingProxyType
 from typing import TYPE_CHECKING
 
-from readers.streams import ReadOptions, Recording, RecordingError
+from readers.streams import ReadOptions, Recording, RecordingError, WorkbenchError
 
 if TYPE_CHECKING:
     from tempfile import TemporaryDirectory
@@ -45,20 +45,32 @@ def open_recording(path: Path | str, options: ReadOptions = ReadOptions()) -> Re
 
     Raises:
         RecordingError: the path is none of these, or nothing of it can be read.
+        StreamError: the options name a stream that is not there.
     """
+    from readers.adjusted import adjusted
+
     path = Path(path)
     try:
-        if path.is_dir():
-            return _open_folder(path, options)
-        if path.name == "metadata.yaml" and _is_bag_folder(path.parent):
-            return _open_bag_folder(path.parent, options)
-        return _open_file(path, options)
+        recording = _open(path, options)
+        try:
+            return adjusted(recording, options)
+        except WorkbenchError:
+            recording.close()
+            raise
     except FileNotFoundError as error:
         raise RecordingError(path, "there is no such file or folder", "check the path") from error
     except PermissionError as error:
         raise RecordingError(path, "it must not be read", "check the permissions") from error
     except OSError as error:
         raise RecordingError(path, f"it cannot be read ({error.strerror or error})", "check the disk") from error
+
+
+def _open(path: Path, options: ReadOptions) -> Recording:
+    if path.is_dir():
+        return _open_folder(path, options)
+    if path.name == "metadata.yaml" and _is_bag_folder(path.parent):
+        return _open_bag_folder(path.parent, options)
+    return _open_file(path, options)
 
 
 # ------------------------------------------------------------------------------------ files

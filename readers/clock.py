@@ -7,9 +7,11 @@ from __future__ import annotations
 
 import heapq
 import statistics
+from array import array
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from typing import NamedTuple
 
 import numpy as np
 
@@ -51,11 +53,40 @@ def merge(*sources: Iterable[Sample]) -> Iterator[Sample]:
     return heapq.merge(*sources, key=lambda sample: sample.t_ns)
 
 
+JUMP_NS = SECOND_NS
+LONGEST_NS = 2**62
+ROLLOVERS = {
+    "a counter of 32 bits in ns": 2**32,
+    "a counter of 32 bits in µs": 2**32 * 1_000,
+    "a counter of 32 bits in ms": 2**32 * 1_000_000,
+    "a counter of 31 bits in µs": 2**31 * 1_000,
+    "a counter of 31 bits in ms": 2**31 * 1_000_000,
+    "a counter of 24 bits in µs": 2**24 * 1_000,
+}
+"""How long counters run before they begin anew, ns."""
+
+
+class Lag(NamedTuple):
+    """By how much log time exceeds another time, ns: of `messages`, the least, median and greatest."""
+
+    messages: int
+    least_ns: int
+    median_ns: int
+    greatest_ns: int
+
+    @classmethod
+    def of(cls, lags_ns: Sequence[int]) -> Lag:
+        """Of the differences of single messages; zeros where there are none."""
+        if not lags_ns:
+            return cls(0, 0, 0, 0)
+        return cls(len(lags_ns), min(lags_ns), int(statistics.median(lags_ns)), max(lags_ns))
+
+
 @dataclass(slots=True)
 class StreamAudit:
     """Counts what is odd in one stream while its samples pass by in the order of reading.
 
-    Feed every sample to `add`, then read `facts()`. Memory: 16 bytes a sample.
+    Feed every sample to `add`, then read `facts()` and `lag`. Memory: 24 bytes a sample.
     """
 
     stream: str
@@ -64,8 +95,13 @@ class StreamAudit:
     last_ns: int = -1
     samples: int = 0
     longest_gap_ns: int = 0
+    longest_jump_ns: int = 0
     size_px: tuple[int, int] = (0, 0)
-    _steps_ns: list[int] = field(default_factory=list)
+    _steps_ns: array[int] = field(default_factory=lambda: array("q"))
+    _lags_ns: array[int] = field(default_factory=lambda: array("q"))
+    _publish_lags_ns: array[int] = field(default_factory=lambda: array("q"))
+    _own: tuple[int, int] | None = None
+    _rollovers: Counter[str] = field(default_factory=Counter)
 
     def add(self, sample: Sample) -> None:
         """Take note of the next sample of this stream."""
@@ -74,6 +110,7 @@ class StreamAudit:
         if isinstance(sample, Problem):
             self.counts["undecodable"] += 1
             return
+        self._add_clocks(sample)
         if self.last_ns >= 0:
             step = sample.t_ns - self.last_ns
             if step < 0:
@@ -81,7 +118,7 @@ class StreamAudit:
             elif step == 0:
                 self.counts["duplicate_stamp"] += 1
             else:
-                self._steps_ns.append(step)
+                self._steps_ns.append(min(step, LONGEST_NS))
         else:
             self.first_ns = sample.t_ns
         self.last_ns = max(self.last_ns, sample.t_ns)
@@ -96,6 +133,46 @@ class StreamAudit:
         elif isinstance(sample, CameraInfo):
             self.size_px = (sample.camera.width_px, sample.camera.height_px)
 
+    def _add_clocks(self, sample: Sample) -> None:
+        """Take note of how the message's own stamp and its publish time stand to log time."""
+        if sample.published_ns >= 0:
+            if sane_stamp(sample.published_ns, sample.received_ns):
+                self._publish_lags_ns.append(sample.received_ns - sample.published_ns)
+            elif "foreign_publish_time" not in sample.oddities:
+                self.counts["foreign_publish_time"] += 1
+        if sample.header_ns < 0:
+            return
+        if sample.header_ns == 0 and "foreign_stamp" not in sample.oddities:
+            self.counts["zero_stamp"] += 1
+        elif sane_stamp(sample.header_ns, sample.received_ns):
+            self._lags_ns.append(sample.received_ns - sample.header_ns)
+        if self._own is not None:
+            self._judge_step(sample.header_ns - self._own[0], sample.received_ns - self._own[1])
+        self._own = sample.header_ns, sample.received_ns
+
+    def _judge_step(self, own_ns: int, log_ns: int) -> None:
+        """Whether the sensor's clock jumped between two messages, and whether it began anew from zero."""
+        jump_ns = own_ns - log_ns
+        if -JUMP_NS <= own_ns <= max(log_ns, 0) + JUMP_NS:
+            return
+        for counter, length_ns in ROLLOVERS.items():
+            if abs(jump_ns + length_ns) <= JUMP_NS + length_ns // 1000:
+                self.counts["stamp_rollover"] += 1
+                self._rollovers[counter] += 1
+                return
+        self.counts["clock_jump"] += 1
+        self.longest_jump_ns = max(self.longest_jump_ns, jump_ns, key=abs)
+
+    @property
+    def lag(self) -> Lag:
+        """By how much log time exceeds the messages' own sane stamps."""
+        return Lag.of(self._lags_ns)
+
+    @property
+    def publish_lag(self) -> Lag:
+        """By how much log time exceeds sane publish times."""
+        return Lag.of(self._publish_lags_ns)
+
     def facts(self) -> tuple[Fact, ...]:
         """The oddities met so far, each with its count and a sentence."""
         found = dict(self.counts)
@@ -109,11 +186,17 @@ class StreamAudit:
             "undecodable": "messages could not be decoded",
             "out_of_order": "stamps lie before an earlier one",
             "duplicate_stamp": "stamps repeat the one before",
+            "zero_stamp": "header stamps are 0",
+            "clock_jump": "times the header stamps jump by more than a second against log time, "
+            f"at most by {self.longest_jump_ns / 1e9:+.3f} s",
+            "stamp_rollover": f"times the header stamps begin anew, as {' and '.join(self._rollovers)} does",
+            "foreign_publish_time": "publish times are of another epoch than log time",
             "foreign_stamp": "header stamps are of another epoch; log time was used",
             "frozen_stamp": "header stamps never advance; log time was used",
             "zero_quaternion": "quaternions are all zero and were read as unknown",
             "quaternion_norm": "quaternions are not of unit norm and were scaled",
             "identity_orientation": "orientations are the identity with zero covariance, as if never measured; kept",
+            "spare_bytes": "images hold more bytes than their rows and step make; the rest was left out",
             "size_change": "images differ in size from the one before",
             "gap": f"gaps are longer than {GAP_FACTOR:g} usual steps, the longest {self.longest_gap_ns / 1e9:.3f} s",
         }
@@ -136,6 +219,9 @@ def _size_facts(recording: Recording, audits: Mapping[str, StreamAudit]) -> Iter
             for name, camera in cameras
             if name in images
         ]
+    for name, camera in recording.cameras.items():
+        if not camera.calibrated:
+            yield Fact(stream=name, code="calibration_empty", count=1, sentence="the calibration has no focal length")
     for name, size, against in listed:
         if against and size != (0, 0) and size not in against:
             found = " or ".join(f"{width} x {height} px" for width, height in sorted(against))
@@ -143,7 +229,19 @@ def _size_facts(recording: Recording, audits: Mapping[str, StreamAudit]) -> Iter
             yield Fact(stream=name, code="calibration_size", count=1, sentence=sentence)
 
 
+class Survey(NamedTuple):
+    """What reading a recording once tells of its streams: oddities, and each stream's audit by name."""
+
+    facts: tuple[Fact, ...]
+    audits: Mapping[str, StreamAudit]
+
+
 def survey(recording: Recording, progress: Callable[[int, int], None] | None = None) -> tuple[Fact, ...]:
+    """The oddities that `examine` finds."""
+    return examine(recording, progress).facts
+
+
+def examine(recording: Recording, progress: Callable[[int, int], None] | None = None) -> Survey:
     """Read every readable stream once, without decoding images, and count what is odd.
 
     `progress` is called about every thousand samples with the number read and the number expected.
@@ -168,4 +266,4 @@ def survey(recording: Recording, progress: Callable[[int, int], None] | None = N
         if info.count >= 0 and missing:
             sentence = f"{abs(missing)} messages {'fewer' if missing > 0 else 'more'} than the file states"
             facts.append(Fact(stream=info.name, code="count_differs", count=abs(missing), sentence=sentence))
-    return tuple(facts)
+    return Survey(tuple(facts), audits)

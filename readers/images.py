@@ -6,12 +6,14 @@ Compressed images are whatever OpenCV opens, named by their format (``jpeg``, ``
 
 Grey is 0.299 R + 0.587 G + 0.114 B. A JPEG is decoded straight to its own grey channel; of a YUV
 image grey is the Y channel as stored. Colour from YUV follows BT.601 with Y from 16 to 235, as OpenCV
-does it. The orientation that EXIF states is not applied: pixels stay where the sensor had them.
+does it. Depth images hold distances, not grey levels: `decode_depth` reads them. The orientation that EXIF states
+is not applied: pixels stay where the sensor had them.
 Decoded arrays are read-only, because they may be a view of the stored bytes.
 """
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, cast
@@ -35,7 +37,7 @@ cv2.utils.logging.setLogLevel(cv2.utils.logging.LOG_LEVEL_SILENT)
 class RawFormat:
     """How a raw encoding lies in memory and how OpenCV converts it (None: nothing to convert).
 
-    `rows` is the number of stored rows over the number of image rows, times two (3 for NV12 and NV21).
+    `rows` is the number of stored rows over the number of image rows, times two (3 for NV12 and NV21, 6 for NV24).
     """
 
     bits: int
@@ -78,11 +80,17 @@ RAW_FORMATS: dict[str, RawFormat] = _packed() | {
     "yuy2": _YUYV,
     "nv12": RawFormat(8, 1, None, cv2.COLOR_YUV2RGB_NV12, rows=3),
     "nv21": RawFormat(8, 1, None, cv2.COLOR_YUV2RGB_NV21, rows=3),
+    "nv24": RawFormat(8, 1, None, None, rows=6),
 }
 """The raw encodings, by their names in lower case."""
 
 COMPRESSED_FORMATS = ("jpeg", "png", "tiff", "bmp", "webp", "pnm", "jp2", "exr", "hdr", "sun", "avif")
 """The compressed formats (whether each can be decoded depends on how OpenCV was built)."""
+
+DEPTH_HEADER = struct.Struct("<iff")
+"""Before the picture of a compressedDepth image: its format, and the parameters A and B of 32FC1."""
+MOST_PX = 1 << 27
+"""Larger pictures are taken for damage, before anything of their size is allocated."""
 
 _ALIASES = {"jpg": "jpeg", "tif": "tiff"} | dict.fromkeys(("pgm", "ppm", "pbm"), "pnm")
 
@@ -104,7 +112,7 @@ def decode_grey(sample: ImageSample) -> Pixels:
     if raw is None:
         return _finish(_decompress(sample, cv2.IMREAD_GRAYSCALE))
     pixels = _raw_pixels(sample, raw)
-    if raw.rows == 3:
+    if raw.rows > 2:
         pixels = pixels[: sample.height_px]
     return _finish(_convert(sample, pixels, raw.to_grey))
 
@@ -124,7 +132,98 @@ def decode_colour(sample: ImageSample) -> Pixels:
     raw = RAW_FORMATS.get(sample.encoding.lower())
     if raw is None:
         return _finish(cv2.cvtColor(_decompress(sample, cv2.IMREAD_COLOR), cv2.COLOR_BGR2RGB))
-    return _finish(_convert(sample, _raw_pixels(sample, raw), raw.to_rgb))
+    pixels = _raw_pixels(sample, raw)
+    return _finish(_nv24_rgb(pixels) if raw.rows == 6 else _convert(sample, pixels, raw.to_rgb))
+
+
+def _nv24_rgb(planes: Pixels) -> Pixels:
+    """RGB of Y and, below it, U and V in turn for every pixel [3 h, w]: BT.601 with Y from 16 to 235."""
+    height, width = planes.shape[0] // 3, planes.shape[1]
+    y = 1.164 * (planes[:height].astype(np.float32) - 16.0)
+    u, v = np.moveaxis(planes[height:].reshape(height, width, 2).astype(np.float32) - 128.0, 2, 0)
+    rgb = np.stack([y + 1.596 * v, y - 0.813 * v - 0.391 * u, y + 2.018 * u], axis=-1)
+    return np.asarray(np.clip(np.rint(rgb), 0, 255), np.uint8)
+
+
+def decode_depth(sample: ImageSample) -> NDArray[np.float32]:
+    """Decode to distances.
+
+    Args:
+        sample: a raw image of 16-bit millimetres (``16UC1``, ``mono16``) or float metres (``32FC1``), a PNG of
+            millimetres, or a ``compressedDepth`` image of either: 12 bytes of parameters before a PNG or RVL.
+
+    Returns:
+        Read-only metres, shape [height, width]; NaN where nothing was measured.
+
+    Raises:
+        ImageError: the image is damaged or holds no distances.
+    """
+    name = sample.encoding.lower()
+    if is_depth(sample.encoding):
+        return _finish_depth(_compressed_depth(sample))
+    if name == "32fc1":
+        return _finish_depth(_float_pixels(sample))
+    grey = decode_grey(sample)
+    if grey.dtype != np.uint16:
+        raise _error(sample, "it holds no distances; known are 16UC1, 32FC1, compressedDepth and PNG of 16 bits")
+    return _finish_depth(_metres(cast("NDArray[np.uint16]", grey)))
+
+
+def is_depth(encoding: str) -> bool:
+    """Whether an encoding is one of compressedDepth, such as ``16UC1; compressedDepth png``."""
+    return "compresseddepth" in encoding.lower()
+
+
+def _metres(millimetres: NDArray[np.uint16]) -> NDArray[np.float32]:
+    depth = millimetres.astype(np.float32) * np.float32(0.001)
+    depth[millimetres == 0] = np.nan
+    return depth
+
+
+def _float_pixels(sample: ImageSample) -> NDArray[np.float32]:
+    """The pixels of a raw 32FC1 image [h, w]; zero and infinity are no distances."""
+    whole = _stored_rows(sample, sample.width_px * 4, sample.height_px)
+    pixels = whole.view(">f4" if sample.big_endian else "<f4").astype(np.float32)
+    pixels[~(np.isfinite(pixels) & (pixels > 0))] = np.nan
+    return pixels
+
+
+def _compressed_depth(sample: ImageSample) -> NDArray[np.float32]:
+    """Metres of a compressedDepth image: of ``32FC1`` A / (stored - B), parameters A and B before the picture."""
+    data = memoryview(sample.data)
+    if len(data) < DEPTH_HEADER.size + 8:
+        raise _error(sample, f"it holds {len(data)} bytes, too few for its parameters and a picture")
+    _, scale, shift = DEPTH_HEADER.unpack_from(data)
+    stored = _depth_picture(sample, data[DEPTH_HEADER.size :])
+    if not sample.encoding.lower().startswith("32fc1"):
+        return _metres(stored)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        depth = np.float32(scale) / (stored.astype(np.float32) - np.float32(shift))
+    depth[(stored == 0) | ~np.isfinite(depth)] = np.nan
+    return np.asarray(depth, np.float32)
+
+
+def _depth_picture(sample: ImageSample, packed: memoryview) -> NDArray[np.uint16]:
+    """The picture behind the parameters [h, w]: a PNG, or columns, rows and RVL."""
+    if bytes(packed[:4]) == b"\x89PNG":
+        pixels = _decompress(dataclasses.replace(sample, encoding="png", payload=packed), cv2.IMREAD_UNCHANGED)
+        if pixels.dtype != np.uint16 or pixels.ndim != 2:
+            raise _error(sample, "its PNG is not of one channel of 16 bits")
+        return cast("NDArray[np.uint16]", pixels)
+    from readers.rvl import unpack
+
+    width, height = struct.unpack_from("<ii", packed)
+    if not (width > 0 and height > 0 and width * height <= MOST_PX):
+        raise _error(sample, f"it claims a size of {width} x {height} px")
+    try:
+        return unpack(packed[8:], width * height).reshape(height, width)
+    except ValueError as error:
+        raise _error(sample, str(error)) from None
+
+
+def _finish_depth(depth: NDArray[np.float32]) -> NDArray[np.float32]:
+    depth.setflags(write=False)
+    return depth
 
 
 def image_header(data: bytes | memoryview) -> tuple[str, int, int]:
@@ -186,22 +285,26 @@ def _jpeg_size(data: bytes | memoryview) -> tuple[int, int]:
 def _raw_pixels(sample: ImageSample, raw: RawFormat) -> Pixels:
     """The stored pixels without padding and in this machine's byte order, [rows, width] or [rows, width, n]."""
     width, height = sample.width_px, sample.height_px
-    if width <= 0 or height <= 0:
-        raise _error(sample, f"its size is {width} x {height} px")
-    row = width * raw.channels * raw.bits // 8
+    rows = (height * raw.rows + 1) // 2
+    stored = _stored_rows(sample, width * raw.channels * raw.bits // 8, rows)
+    shape = (rows, width) if raw.channels == 1 else (rows, width, raw.channels)
+    if raw.bits == 8:
+        return stored.reshape(shape)
+    order = ">u2" if sample.big_endian else "<u2"
+    return stored.view(order).astype(np.uint16, copy=False).reshape(shape)
+
+
+def _stored_rows(sample: ImageSample, row: int, rows: int) -> NDArray[np.uint8]:
+    """The bytes of a raw image without padding [rows, row]."""
+    if sample.width_px <= 0 or sample.height_px <= 0:
+        raise _error(sample, f"its size is {sample.width_px} x {sample.height_px} px")
     step = sample.step_bytes or row
     if step < row:
-        raise _error(sample, f"a row of {width} px takes {row} bytes, but its step is {step} bytes")
-    rows = (height * raw.rows + 1) // 2
+        raise _error(sample, f"a row of {sample.width_px} px takes {row} bytes, but its step is {step} bytes")
     data = sample.data
     if len(data) < rows * step:
         raise _error(sample, f"{rows} rows of {step} bytes need {rows * step} bytes, but it holds {len(data)}")
-    stored = np.frombuffer(data, np.uint8, rows * step).reshape(rows, step)[:, :row]
-    shape = (rows, width) if raw.channels == 1 else (rows, width, raw.channels)
-    if raw.bits == 8:
-        return np.ascontiguousarray(stored).reshape(shape)
-    order = ">u2" if sample.big_endian else "<u2"
-    return np.ascontiguousarray(stored).view(order).astype(np.uint16, copy=False).reshape(shape)
+    return np.ascontiguousarray(np.frombuffer(data, np.uint8, rows * step).reshape(rows, step)[:, :row])
 
 
 def _convert(sample: ImageSample, pixels: Pixels, code: int | None) -> Pixels:
@@ -220,8 +323,8 @@ def _convert(sample: ImageSample, pixels: Pixels, code: int | None) -> Pixels:
 def _decompress(sample: ImageSample, mode: int) -> Pixels:
     """Decode a compressed image, [height, width] or [height, width, 3] in the order B, G, R."""
     name = sample.encoding.lower()
-    if "compresseddepth" in name:
-        raise _error(sample, "compressedDepth holds distances, not a picture, and is not supported")
+    if is_depth(name) or name == "32fc1":
+        raise _error(sample, "32FC1 and compressedDepth hold distances, not a picture; depth() reads them")
     if _ALIASES.get(name, name) not in COMPRESSED_FORMATS:
         known = ", ".join((*RAW_FORMATS, *COMPRESSED_FORMATS))
         raise _error(sample, f"this encoding is not known; known are {known}")
@@ -230,6 +333,9 @@ def _decompress(sample: ImageSample, mode: int) -> Pixels:
         raise _error(sample, "it holds 0 bytes")
     if _cut_short(data):
         raise _error(sample, f"it is cut short, its {len(data)} bytes have no end mark")
+    _, width, height = image_header(data)
+    if width * height > MOST_PX:
+        raise _error(sample, f"it claims a size of {width} x {height} px")
     flags = mode | cv2.IMREAD_ANYDEPTH | cv2.IMREAD_IGNORE_ORIENTATION
     try:
         pixels = cv2.imdecode(np.frombuffer(data, np.uint8), flags)

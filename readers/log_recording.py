@@ -37,6 +37,7 @@ from readers.salvage import Loss
 from readers.streams import (
     Camera,
     CameraInfo,
+    Clock,
     Damage,
     Problem,
     ReadOptions,
@@ -56,8 +57,8 @@ FRAME_SEARCH_NS = 30 * SECOND_NS
 class Topic:
     """One topic of the log, or the part of it that has one message type.
 
-    `lag_ns` is by how much log time exceeds the messages' own stamps; `pairs` are the streams that a topic of
-    transforms splits into.
+    `lag_ns` is by how much log time exceeds the samples' times; `pairs` are the streams that a topic of transforms
+    splits into. `clock` and `offset_ns` are what the user asked for.
     """
 
     name: str
@@ -68,6 +69,8 @@ class Topic:
     lag_ns: int = 0
     trust_stamps: bool = True
     pairs: tuple[StreamInfo, ...] = ()
+    clock: Clock = Clock.HEADER
+    offset_ns: int = 0
     decoders: dict[Channel, Decoder] = field(default_factory=dict)
     fixed: dict[Channel, FixedReader] = field(default_factory=dict)
 
@@ -95,11 +98,22 @@ class Topic:
             reason=self.reason,
         )
 
+    def arrival(self, message: Message) -> Arrival:
+        """Where and when a message of the topic came."""
+        return Arrival(
+            self.name,
+            message.log_ns,
+            self.trust_stamps,
+            published_ns=message.publish_ns,
+            clock=self.clock,
+            offset_ns=self.offset_ns,
+        )
+
     def samples(self, message: Message) -> Iterator[Sample]:
         """The samples of one message; a `Problem` if it cannot be made into any."""
         assert self.reader is not None
         try:
-            arrival = Arrival(self.name, message.log_ns, self.trust_stamps)
+            arrival = self.arrival(message)
             fixed = self.fixed.get(message.channel)
             if fixed is not None and (sample := fixed(message.data, arrival)) is not None:
                 yield sample
@@ -144,7 +158,7 @@ class LogRecording(Recording):
         self._logs = tuple(logs)
         self._options = options
         self._scratch = scratch
-        self.notes = (*notes, *dict.fromkeys(note for log in logs for note in log.notes))
+        self.notes = (*notes, *options.clock_notes(), *dict.fromkeys(note for log in logs for note in log.notes))
         self._topics = self._list_topics()
         listed = (info for topic in self._topics for info in topic.streams)
         self._streams = tuple(sorted(listed, key=lambda info: info.name))
@@ -158,11 +172,14 @@ class LogRecording(Recording):
                 grouped.setdefault((channel.topic, channel.type, channel.encoding), []).append(channel)
         names: set[str] = set()
         topics = []
+        clocks, offsets = dict(self._options.clocks), dict(self._options.offsets_ns)
         for (name, type_name, _), channels in grouped.items():
             if name in names:
                 name = f"{name} [{type_name}]"
             names.add(name)
-            topics.append(self._topic(name, channels))
+            topic = self._topic(name, channels)
+            topic.clock, topic.offset_ns = clocks.get(name, Clock.HEADER), offsets.get(name, 0)
+            topics.append(topic)
         for topic in topics:
             if not topic.reason and topic.reader is not None:
                 self._look_at(topic)
@@ -197,15 +214,18 @@ class LogRecording(Recording):
         stamps: list[tuple[int, int]] = []
         for message in itertools.islice(self._messages(topic.channels), FIRST_MESSAGES):
             try:
+                if topic.clock is Clock.PUBLISH:
+                    stamps.append((message.log_ns, message.publish_ns))
                 if message.channel in topic.fixed and (found := header_of(message.data)) is not None:
                     topic.frame = topic.frame or found[1]
-                    stamps.append((message.log_ns, found[0]))
+                    if topic.clock is Clock.HEADER:
+                        stamps.append((message.log_ns, found[0]))
                     continue
                 decoded = topic.decoders[message.channel](message.data)
                 list(samples_of(topic.reader, decoded, Arrival(topic.name, message.log_ns)))
                 topic.frame = topic.frame or frame_of(decoded)
                 stamp = header_stamp(decoded)
-                if stamp is not None:
+                if stamp is not None and topic.clock is Clock.HEADER:
                     stamps.append((message.log_ns, stamp_ns(stamp)))
             except UnsupportedError as error:
                 topic.reason = str(error)
@@ -217,16 +237,19 @@ class LogRecording(Recording):
         self._judge_clock(topic, stamps)
 
     def _judge_clock(self, topic: Topic, stamps: list[tuple[int, int]]) -> None:
-        """Decide from pairs (log time, own stamp) whether the stamps are a clock, and how far off it is."""
+        """Decide from pairs (log time, stamp) whether the stamps are a clock, and how far off it is."""
+        topic.lag_ns = -topic.offset_ns
         lags = [log_ns - own_ns for log_ns, own_ns in stamps if sane_stamp(own_ns, log_ns)]
         log_times, own_times = {pair[0] for pair in stamps}, {pair[1] for pair in stamps}
         topic.trust_stamps = len(log_times) < 3 or len(own_times) > 1
-        if stamps and not lags:
+        if stamps and not lags and topic.clock is Clock.PUBLISH:
+            self._note(f"{topic.name}: it has no publish times of the log's epoch; log time is used.")
+        elif stamps and not lags:
             self._note(f"{topic.name}: {_epochs(*stamps[0])}; log time is used.")
         elif not topic.trust_stamps:
             self._note(f"{topic.name}: the header stamps do not advance; log time is used.")
         elif lags:
-            topic.lag_ns = int(statistics.median(lags))
+            topic.lag_ns += int(statistics.median(lags))
 
     def _find_pairs(self, topic: Topic) -> None:
         """List the frame pairs of a topic of transforms: those that were asked for, or those that come first."""

@@ -18,7 +18,7 @@ import numpy as np
 
 from readers.clock import sane_stamp
 from readers.decoding import MessageError
-from readers.images import image_header
+from readers.images import RAW_FORMATS, image_header, is_depth
 from readers.streams import (
     UNKNOWN_COV3,
     UNKNOWN_COV6,
@@ -26,6 +26,7 @@ from readers.streams import (
     UNKNOWN_VEC3,
     Camera,
     CameraInfo,
+    Clock,
     FloatArray,
     GnssSample,
     ImageSample,
@@ -59,16 +60,25 @@ class Stamps(TypedDict):
     t_ns: int
     received_ns: int
     oddities: tuple[str, ...]
+    header_ns: int
+    published_ns: int
 
 
 @dataclass(slots=True)
 class Arrival:
-    """Where and when a message came: the stream, the log time, and whether its own stamps are a clock."""
+    """Where and when a message came, and what its sample's time is to be.
+
+    `trust_stamps` says whether the topic's own stamps are a clock, `clock` which time was asked for, and `offset_ns`
+    what is added to it.
+    """
 
     stream: str
     received_ns: int
     trust_stamps: bool = True
     oddities: list[str] = field(default_factory=list)
+    published_ns: int = -1
+    clock: Clock = Clock.HEADER
+    offset_ns: int = 0
 
     @property
     def source(self) -> str:
@@ -76,7 +86,7 @@ class Arrival:
         return f"{self.stream}, logged at {self.received_ns} ns"
 
     def stamps(self, stamp: Any = None) -> Stamps:
-        """The times of the sample: its own stamp where that is sane, else the log time, which is noted.
+        """The times of the sample: by the clock asked for where that is sane, else the log time, which is noted.
 
         Call it last: it takes the oddities found so far with it.
         """
@@ -84,15 +94,30 @@ class Arrival:
 
     def stamps_ns(self, own_ns: int | None) -> Stamps:
         """The same of a stamp in nanoseconds, None for none."""
+        header_ns = -1 if own_ns is None else own_ns
         t_ns = self.received_ns
-        if own_ns is not None:
-            if not sane_stamp(own_ns, self.received_ns):
-                self.oddities.append("foreign_stamp")
-            elif not self.trust_stamps:
+        if self.clock is Clock.PUBLISH:
+            t_ns = self._sane(self.published_ns, "foreign_publish_time")
+        elif self.clock is Clock.HEADER and own_ns is not None:
+            t_ns = self._sane(header_ns, "foreign_stamp")
+            if not self.trust_stamps and t_ns == header_ns:
                 self.oddities.append("frozen_stamp")
-            else:
-                t_ns = own_ns
-        return Stamps(stream=self.stream, t_ns=t_ns, received_ns=self.received_ns, oddities=tuple(self.oddities))
+                t_ns = self.received_ns
+        return Stamps(
+            stream=self.stream,
+            t_ns=t_ns + self.offset_ns,
+            received_ns=self.received_ns,
+            oddities=tuple(self.oddities),
+            header_ns=header_ns,
+            published_ns=self.published_ns,
+        )
+
+    def _sane(self, t_ns: int, oddity: str) -> int:
+        """A time of the log's epoch, or the log time, which is noted."""
+        if sane_stamp(t_ns, self.received_ns):
+            return t_ns
+        self.oddities.append(oddity)
+        return self.received_ns
 
 
 def stamp_ns(stamp: Any) -> int:
@@ -216,6 +241,9 @@ def image_sample(
     """
     if height_px * step_bytes > len(payload):
         raise MessageError(f"the image states {height_px} rows of {step_bytes} bytes and holds {len(payload)} bytes")
+    form = RAW_FORMATS.get(encoding.lower())
+    if step_bytes and form is not None and len(payload) > (height_px * form.rows + 1) // 2 * step_bytes:
+        arrival.oddities.append("spare_bytes")
     return ImageSample(
         **arrival.stamps_ns(own_ns),
         encoding=encoding,
@@ -230,15 +258,14 @@ def image_sample(
 
 def compressed_image(message: Any, arrival: Arrival) -> ImageSample:
     """sensor_msgs/CompressedImage and foxglove.CompressedImage."""
-    if "compressedDepth" in message.format:
-        raise UnsupportedError(f"depth images of the format {message.format!r} (compressedDepth) are not supported")
     payload = _bytes(message.data)
     if not payload:
         raise MessageError("the image holds no bytes")
-    encoding, width, height = image_header(payload)
+    stated = str(message.format)
+    encoding, width, height = (stated, 0, 0) if is_depth(stated) else image_header(payload)
     return ImageSample(
         **arrival.stamps(header_stamp(message)),
-        encoding=encoding or stated_format(message.format),
+        encoding=encoding or stated_format(stated),
         payload=payload,
         width_px=width,
         height_px=height,
@@ -402,7 +429,7 @@ def transforms(message: Any, arrival: Arrival) -> list[PoseSample]:
     """tf2_msgs/TFMessage, tf/tfMessage, foxglove.FrameTransform(s): each frame pair is a stream of its own."""
     found = []
     for part in message.transforms if hasattr(message, "transforms") else [message]:
-        single = transform(part, Arrival(arrival.stream, arrival.received_ns, arrival.trust_stamps))
+        single = transform(part, replace(arrival, oddities=[]))
         stream = pair_stream(arrival.stream, single.parent_frame, single.child_frame)
         found.append(replace(single, stream=stream))
     return found

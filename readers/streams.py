@@ -74,8 +74,10 @@ class StreamKind(enum.StrEnum):
 class Sample:
     """One timestamped datum of a stream.
 
-    `t_ns` is the sensor's time (the header stamp where it is sane, else the log time);
-    `received_ns` is the log time. Both are integer nanoseconds of the same epoch. `oddities` are the
+    `t_ns` is the sensor's time (the header stamp where it is sane, else the log time, unless the user chose another
+    clock, plus the user's offset); `received_ns` is the log time. Both are integer nanoseconds of the same epoch.
+    `header_ns` is the message's own stamp as it stands there, sane or not, and `published_ns` when it was sent; -1
+    where there is none. `oddities` are the
     codes of what the reader met in this one message and how it took it, such as ``foreign_stamp``;
     `readers.clock.StreamAudit` counts them and has a sentence for each.
     """
@@ -84,6 +86,8 @@ class Sample:
     t_ns: int
     received_ns: int
     oddities: tuple[str, ...] = ()
+    header_ns: int = field(default=-1, compare=False)
+    published_ns: int = field(default=-1, compare=False)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -140,6 +144,16 @@ class ImageSample(Sample):
         from readers.images import decode_colour
 
         return decode_colour(self)
+
+    def depth(self) -> NDArray[np.float32]:
+        """Decode a depth image to metres, shape [height, width], NaN where nothing was measured.
+
+        Raises:
+            ImageError: the image is damaged or holds no distances.
+        """
+        from readers.images import decode_depth
+
+        return decode_depth(self)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -270,7 +284,7 @@ class Camera:
     P [3, 4] in px; a matrix that the log does not have is NaN. `body_t_camera` [4, 4] is the transform that
     maps points of the camera (x right, y down, z ahead) into the body, whose axes are those of the recording's own
     odometry, IMU and poses; NaN where unknown.
-    A size of 0 x 0 px is unknown.
+    A size of 0 x 0 px is unknown. `source` says where it comes from, empty for the recording itself.
     """
 
     width_px: int
@@ -282,6 +296,7 @@ class Camera:
     projection: FloatArray
     frame: str = ""
     body_t_camera: FloatArray = field(default_factory=unknown_transform, repr=False)
+    source: str = field(default="", compare=False)
 
     @property
     def calibrated(self) -> bool:
@@ -308,19 +323,67 @@ class Problem(Sample):
     frame: int = -1
 
 
+@dataclass(frozen=True, slots=True)
+class CameraFile:
+    """A file with the calibration of a camera.
+
+    `topic` is the stream of images that it is for, empty for the only one or those that the file names; `name` the
+    camera in the file, empty for the only one or that of the topic.
+    """
+
+    path: Path
+    topic: str = ""
+    name: str = ""
+
+
+class Clock(enum.StrEnum):
+    """Whose time a sample carries: the sensor's (header stamp), the recorder's (log), or the sender's (publish)."""
+
+    HEADER = "header"
+    LOG = "log"
+    PUBLISH = "publish"
+
+    @property
+    def sentence(self) -> str:
+        """The clock in words."""
+        words = {"header": "header stamps", "log": "log times", "publish": "publish times"}
+        return words[self.value]
+
+
 @dataclass(frozen=True, slots=True, kw_only=True)
 class ReadOptions:
     """What a user tells a reader that the recording does not say itself.
 
     `rate_hz` is the frame rate of plain frames or a video without times; `times_file` a file with the
     frames' times, in `times_unit` (``s``, ``ms``, ``us``, ``ns`` or ``auto``); `pose_frames` pairs
-    ``parent, child`` whose transforms in ``/tf`` become pose streams (all pairs found if empty).
+    ``parent, child`` whose transforms in ``/tf`` become pose streams (all pairs found if empty). `clocks` are pairs of
+    a topic and the `Clock` that its samples' times come from, ``header`` where none is named; `offsets_ns` pairs of a
+    topic and what is added to the times of its samples. `cameras` are the files of calibrations that take the place of
+    the recording's own; `scale_cameras` has calibrations of another image size scaled to the images.
     """
 
     rate_hz: float | None = None
     times_file: Path | None = None
     times_unit: str = "auto"
     pose_frames: tuple[tuple[str, str], ...] = ()
+    clocks: tuple[tuple[str, Clock], ...] = ()
+    offsets_ns: tuple[tuple[str, int], ...] = ()
+    cameras: tuple[CameraFile, ...] = ()
+    scale_cameras: bool = False
+
+    def clock_of(self, topic: str) -> Clock:
+        """The clock of a topic."""
+        return dict(self.clocks).get(topic, Clock.HEADER)
+
+    def offset_ns_of(self, topic: str) -> int:
+        """What is added to the times of a topic."""
+        return dict(self.offsets_ns).get(topic, 0)
+
+    def clock_notes(self) -> tuple[str, ...]:
+        """What was asked for of the clocks, one sentence each."""
+        chosen = [f"{topic}: times are {clock.sentence}, as asked." for topic, clock in self.clocks]
+        moved = [f"{topic}: {ns / 1e6:+g} ms are added to its times, as asked." for topic, ns in self.offsets_ns]
+        return (*chosen, *moved)
 
 
 # -------------------------------------------------------------------------- stream facts

@@ -230,8 +230,9 @@ def mcap_bytes(messages: Iterable[Raw], profile: str = "", compression: str = "n
 
 
 def plain(sample: Sample) -> dict[str, Any]:
-    """A sample as a dictionary that can be compared with ==."""
-    return {f.name: _plain(getattr(sample, f.name)) for f in dataclasses.fields(sample)} | {"": type(sample).__name__}
+    """What two equal samples have in common, as a dictionary that can be compared with ==."""
+    compared = (f for f in dataclasses.fields(sample) if f.compare)
+    return {f.name: _plain(getattr(sample, f.name)) for f in compared} | {"": type(sample).__name__}
 
 
 def _plain(value: Any) -> Any:

@@ -21,8 +21,9 @@ import workbench.session
 import workbench.settings
 from readers.streams import Fact, StreamKind, WorkbenchError
 from tests import toy_session
-from tests.toy_session import START, TextLog, ToyMission, ToyRun
+from tests.toy_session import START, TextLog, ToyMission, ToyRun, toy_rows
 from tests.toys import image
+from workbench import manifest
 from workbench.cli import files_of, main, moment, shown, table, view_command
 from workbench.inputs import digest, parse_time
 
@@ -100,6 +101,7 @@ def test_a_replay_leaves_a_run_folder_and_a_summary(toys: Path, shell: Shell) ->
     assert sorted(p.name for p in folder.iterdir()) == [
         "best.checkpoints",
         "best.rrd",
+        "best.sha256",
         "best.toml",
         "best.tum",
         "sensors.rrd",
@@ -274,7 +276,9 @@ def test_the_scale_comes_from_height_and_calibration(toys: Path, shell: Shell) -
     values = shell.replay("walk-camera.log", "--json").json
     assert values["unit"] == "m"
     assert values["scale"] == "height of /range over focal length 200 px of the log's calibration"
-    assert values["notes"] == ["lens distortion is not removed from the images"]
+    model = "4 x 3 px, f 200 200, centre 2 1.5, distortion plumb_bob (0.1, 0, 0, 0, 0)"
+    distorted = "lens distortion is not removed from the images"
+    assert values["notes"] == [f"camera: {model}, of the log's calibration", distorted]
     assert values["path_length"] == pytest.approx(3.9)
 
 
@@ -482,6 +486,9 @@ def test_an_interrupt_ends_with_status_130_and_whole_files(tmp_path: Path, numbe
     assert sum(line.startswith("step") for line in steps) == summary["frames"]
     assert steps[-1].startswith("finish")
     assert not (folder / "sensors.toml").exists()
+    checks = manifest.verify(folder, "best", toy_rows)
+    assert {check.name for check in checks} == {"best.rrd", "best.toml", "best.tum", "sensors.rrd"}
+    assert not any(check.problems for check in checks)
 
 
 def test_a_second_interrupt_ends_at_once_and_is_noted(
@@ -494,6 +501,7 @@ def test_a_second_interrupt_ends_at_once_and_is_noted(
     assert shell.replay("walk.log").status == 130
     state = tomllib.loads(Path("results/walk/best.toml").read_text())
     assert (state["complete"], state["interrupted"]) == (False, True)
+    assert not Path("results/walk/best.sha256").exists()
     assert len(Path("results/walk/best.tum").read_text().splitlines()) == 40
 
 
@@ -546,7 +554,7 @@ def test_every_help_has_an_example(shell: Shell, command: list[str]) -> None:
 
 def test_inspect_lists_streams_oddities_and_damage(toys: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     fact = Fact(stream="/imu", code="gap", count=2, sentence="2 gaps")
-    monkeypatch.setattr(readers.clock, "survey", lambda recording, progress=None: (fact,), raising=False)
+    monkeypatch.setattr(readers.clock, "examine", lambda recording: readers.clock.Survey((fact,), {}))
     Path("walk-damaged-camera.log").touch()
     said = shell("inspect", "walk-damaged-camera.log")
     assert said.status == 3

@@ -134,6 +134,16 @@ def test_yuv422(encoding: str, pad: int) -> None:
     np.testing.assert_allclose(image.colour().astype(float), expected, atol=1.5)
 
 
+@pytest.mark.parametrize("pad", [0, 3])
+def test_semi_planar_with_chroma_of_every_pixel(pad: int) -> None:
+    y = RNG.integers(16, 236, (H, W), dtype=np.uint8)
+    u, v = (RNG.integers(90, 166, (H, W), dtype=np.uint8) for _ in "uv")
+    chroma = np.stack([u, v], axis=-1).reshape(2 * H, W)
+    image = sample("NV24", stored(np.concatenate([y, chroma]), step=W + pad), step_bytes=W + pad)
+    np.testing.assert_array_equal(image.grey(), y)
+    np.testing.assert_allclose(image.colour().astype(float), bt601(y, u, v), atol=1.5)
+
+
 @pytest.mark.parametrize("encoding", ["nv12", "nv21"])
 @pytest.mark.parametrize("pad", [0, 4])
 def test_semi_planar(encoding: str, pad: int) -> None:
@@ -253,7 +263,8 @@ def test_cut_jpeg_whose_thumbnail_is_whole_is_found() -> None:
         ("jpeg", {}, 10, r"OpenCV cannot decode its 10 bytes"),
         ("16UC1; compressedDepth png", {}, 10, r"compressedDepth"),
         ("h264", {}, 10, r"not known; known are rgb8, .*mono8.*jpeg"),
-        ("32FC1", {}, 10, r"not known"),
+        ("32FC1", {}, 10, r"distances"),
+        ("64FC1", {}, 10, r"not known"),
     ],
 )
 def test_what_cannot_be_decoded_says_why(encoding: str, fields: dict[str, int], length: int, words: str) -> None:
@@ -279,8 +290,134 @@ def test_float_tiff_is_refused() -> None:
 
 
 def test_every_encoding_that_the_workbench_promises_is_there() -> None:
-    promised = ["mono8", "mono16", "yuv422", "yuyv", "uyvy", "nv12", "8uc1", "16uc1", "8uc3"]
+    promised = [
+        "mono8",
+        "mono16",
+        "yuv422",
+        "yuv422_yuy2",
+        "yuyv",
+        "uyvy",
+        "nv12",
+        "nv21",
+        "nv24",
+        "8uc1",
+        "16uc1",
+        "8uc3",
+    ]
     promised += [f"{order}{bits}" for order in ("rgb", "bgr", "rgba", "bgra") for bits in (8, 16)]
     promised += [f"bayer_{order}{bits}" for order in ("rggb", "bggr", "gbrg", "grbg") for bits in (8, 16)]
     assert set(promised) <= set(RAW_FORMATS)
     assert {"jpeg", "png"} <= set(COMPRESSED_FORMATS)
+
+
+# ---------------------------------------------------------------------------------- depth
+
+
+def packed_rvl(values: NDArray[np.generic]) -> bytes:
+    """RVL by the paper's description, plainly: runs of zeros, runs of differences, numbers in nibbles."""
+    nibbles: list[int] = []
+
+    def put(number: int) -> None:
+        while number > 7:
+            nibbles.append(8 | (number & 7))
+            number >>= 3
+        nibbles.append(number)
+
+    flat, at, before = values.astype(int).ravel().tolist(), 0, 0
+    while at < len(flat):
+        zeros = next((k for k, v in enumerate(flat[at:]) if v), len(flat) - at)
+        put(zeros)
+        at += zeros
+        run = next((k for k, v in enumerate(flat[at:]) if not v), len(flat) - at)
+        put(run)
+        for value in flat[at : at + run]:
+            difference = value - before
+            put(2 * difference if difference >= 0 else -2 * difference - 1)
+            before = value
+        at += run
+    nibbles += [0] * (-len(nibbles) % 8)
+    words = [sum(n << (28 - 4 * k) for k, n in enumerate(nibbles[i : i + 8])) for i in range(0, len(nibbles), 8)]
+    return np.array(words, "<u4").tobytes()
+
+
+def compressed_depth(values: NDArray[np.generic], how: str, a: float = 0.0, b: float = 0.0) -> bytes:
+    head = np.array([0], "<i4").tobytes() + np.array([a, b], "<f4").tobytes()
+    if how == "png":
+        return head + cv2.imencode(".png", values)[1].tobytes()
+    height, width = values.shape
+    return head + np.array([width, height], "<i4").tobytes() + packed_rvl(values)
+
+
+@pytest.mark.parametrize("how", ["png", "rvl"])
+@pytest.mark.parametrize("holes", [0.0, 0.5, 1.0])
+def test_compressed_depth_of_millimetres(how: str, holes: float) -> None:
+    values = RNG.integers(1, 65536, (37, 23)).astype(np.uint16)
+    values[RNG.random(values.shape) < holes] = 0
+    found = sample(f"16UC1; compressedDepth {how}", compressed_depth(values, how), width_px=0, height_px=0).depth()
+    np.testing.assert_allclose(found, np.where(values == 0, np.nan, values / 1000), rtol=1e-6)
+    assert found.dtype == np.float32
+    assert not found.flags.writeable
+
+
+@pytest.mark.parametrize("how", ["png", "rvl"])
+def test_compressed_depth_of_metres_is_stored_as_inverse_depth(how: str) -> None:
+    depth = RNG.uniform(0.5, 9.5, (20, 30))
+    quantum, greatest = 100.0, 10.0  # as the writer does it: A = z0 (z0 + 1), B = 1 - A / z_max
+    a = quantum * (quantum + 1)
+    b = 1.0 - a / greatest
+    stored_values = np.rint(a / depth + b).astype(np.uint16)
+    stored_values[0, :5] = 0
+    found = sample("32FC1; compressedDepth", compressed_depth(stored_values, how, a, b)).depth()
+    assert np.isnan(found[0, :5]).all()
+    np.testing.assert_allclose(found[1:], depth[1:], atol=9.5**2 / a)
+
+
+@pytest.mark.parametrize("big", [False, True])
+def test_raw_depth(big: bool) -> None:
+    metres = RNG.uniform(0.1, 50.0, (H, W)).astype(np.float32)
+    metres[0, :4] = np.nan, 0.0, np.inf, -1.0
+    step = 4 * W + 8
+    found = sample("32FC1", stored(metres, step=step, big=big), step_bytes=step, big_endian=big).depth()
+    assert np.isnan(found[0, :4]).all()
+    np.testing.assert_array_equal(found[1:], metres[1:])
+    with pytest.raises(ImageError, match=r"distances, not a picture; depth\(\) reads them"):
+        sample("32FC1", stored(metres)).grey()
+    values = RNG.integers(0, 65536, (H, W)).astype(np.uint16)
+    expected = np.where(values == 0, np.nan, values / 1000)
+    np.testing.assert_allclose(sample("16UC1", stored(values, big=big), big_endian=big).depth(), expected, rtol=1e-6)
+
+
+def test_damaged_and_hostile_depth_is_refused() -> None:
+    good = compressed_depth(RNG.integers(1, 9999, (20, 30)).astype(np.uint16), "rvl")
+    huge = good[:12] + np.array([2**20, 2**20], "<i4").tobytes() + good[20:]
+    negative = good[:12] + np.array([-30, 20], "<i4").tobytes() + good[20:]
+    for data, words in (
+        (good[:10], "too few"),
+        (good[:60], "do not hold 600 px"),
+        (huge, "claims a size"),
+        (negative, "claims a size"),
+        (good[:20] + b"\xff" * 200, "do not hold"),
+        (good[:20] + b"\0" * 400, "do not hold"),
+        (compressed_depth(np.zeros((4, 4), np.uint8), "png"), "one channel of 16 bits"),
+    ):
+        with pytest.raises(ImageError, match=words):
+            sample("16UC1; compressedDepth", data).depth()
+    with pytest.raises(ImageError, match="no distances"):
+        sample("mono8", bytes(H * W)).depth()
+
+
+def test_random_bytes_never_break_the_unpacking_of_depth() -> None:
+    rng = np.random.default_rng(11)
+    for size in rng.integers(0, 300, 300):
+        data = bytes(12) + np.array([40, 30], "<i4").tobytes() + rng.bytes(int(size))
+        try:
+            assert sample("16UC1; compressedDepth rvl", data).depth().shape == (30, 40)
+        except ImageError:
+            continue
+
+
+def test_a_small_file_that_claims_a_huge_picture_is_refused_before_it_is_unpacked() -> None:
+    png = bytearray(cv2.imencode(".png", np.zeros((2, 2), np.uint8))[1].tobytes())
+    png[16:24] = (30_000).to_bytes(4, "big") * 2
+    with pytest.raises(ImageError, match="claims a size of 30000 x 30000 px"):
+        sample("png", bytes(png)).grey()

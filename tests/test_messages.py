@@ -10,7 +10,7 @@ import pytest
 from made_logs import MS, ROS1, ROS2, START_NS, Maker
 
 from readers.decoding import MessageError
-from readers.messages import READERS, Arrival, OtherUseError, UnsupportedError, reader_of, samples_of, stamp_ns
+from readers.messages import READERS, Arrival, OtherUseError, reader_of, samples_of, stamp_ns
 from readers.streams import StreamKind
 
 LOG_NS = START_NS + 7 * MS
@@ -205,10 +205,17 @@ def test_compressed_images_tell_their_size() -> None:
     assert (found.width_px, found.height_px) == (40, 30)
 
 
-def test_compressed_depth_is_refused_by_name() -> None:
+def test_compressed_depth_keeps_the_format_that_says_how_to_read_it() -> None:
     message = SimpleNamespace(header=make.header(START_NS), format="32FC1; compressedDepth rvl", data=b"x" * 20)
-    with pytest.raises(UnsupportedError, match="compressedDepth"):
-        read("sensor_msgs/CompressedImage", message)
+    assert read("sensor_msgs/CompressedImage", message).encoding == "32FC1; compressedDepth rvl"
+
+
+def test_bytes_beyond_the_last_row_are_noted() -> None:
+    pixels = np.zeros(50, np.uint8)
+    assert read("sensor_msgs/Image", make.image(START_NS)).oddities == ()
+    assert read("sensor_msgs/Image", make.image(START_NS, data=pixels)).oddities == ("spare_bytes",)
+    nv12 = make.image(START_NS, data=np.zeros(72, np.uint8), encoding="nv12")
+    assert read("sensor_msgs/Image", nv12).oddities == ()
 
 
 @pytest.mark.parametrize("store", [ROS1, ROS2])

@@ -136,6 +136,25 @@ def test_an_error_of_the_estimator_names_frame_and_time() -> None:
     assert decoders() == 0
 
 
+def test_images_that_take_longer_to_decode_keep_their_place() -> None:
+    class Uneven(ToyImage):
+        __slots__ = ()
+
+        def grey(self) -> np.ndarray:  # type: ignore[type-arg, override]
+            time.sleep(0.02 if self.t_ns % 3 == 0 else 0.0)
+            return super().grey()
+
+    fields = [f.name for f in dataclasses.fields(ToyImage)]
+    uneven = [Uneven(**{name: getattr(image(n, n), name) for name in fields}) for n in range(30)]
+    for threads in (1, 2, 5):
+        seen: list[Sample] = []
+        estimator = ToyEstimator(seen=seen.append)
+        out = list(replay(ToyRecording(uneven), estimator, image_stream="/camera", decode_threads=threads))
+        assert frames(out) == list(range(30))
+        assert [sample.t_ns for sample in seen] == list(range(30))
+        assert [bytes(s.data)[0] for s in seen if isinstance(s, ImageSample)] == [int(i.grey()[0, 0]) for i in uneven]
+
+
 def test_closing_stops_the_decoding_thread_promptly() -> None:
     class Slow(ToyImage):
         __slots__ = ()

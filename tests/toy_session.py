@@ -8,6 +8,7 @@ from __future__ import annotations
 import math
 import sys
 import time
+from collections import Counter
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -172,7 +173,12 @@ class ToyRun(TextLog):
         self._say("finish", None if aligned_path is None else len(aligned_path), *summary)
 
 
-WRITERS = Writers(ToySensors, ToyRun)
+def toy_rows(file: Path) -> dict[str, int]:
+    """The lines of a toy file by their first word."""
+    return dict(Counter(f"/{line.partition(' ')[0]}" for line in file.read_text().splitlines()))
+
+
+WRITERS = Writers(ToySensors, ToyRun, toy_rows)
 WALKER = Plugin("toy", WalkSettings, WalkingEstimator)
 
 

@@ -38,13 +38,14 @@ from workbench.terminal import (
 
 if TYPE_CHECKING:
     from pipelines.simulation.mission import SimulatedMission
-    from readers.streams import Camera, ReadOptions, Recording, StreamInfo
+    from readers.streams import Camera, CameraFile, Clock, ReadOptions, Recording, StreamInfo
     from workbench.diagnosis.finding import Finding
     from workbench.reproduce import report as reports_a
     from workbench.reproduce.judged import Statement
     from workbench.reproduce.plans import Reproduced
     from workbench.reproduce.ranging.results import Results as RangeResults
     from workbench.session import Outcome, Request
+    from workbench.sync import Pair
 
 
 MOST_FINDINGS = 5
@@ -82,6 +83,25 @@ TimeFrames = Annotated[
     list[str] | None,
     typer.Option("--tf", metavar="PARENT,CHILD", help="Pair of frames in /tf to read as a pose stream; repeatable."),
 ]
+Clocks = Annotated[
+    list[str] | None,
+    typer.Option("--clock", metavar="TOPIC=CLOCK", help="Times of a topic: header, log or publish; repeatable."),
+]
+Offsets = Annotated[
+    list[str] | None,
+    typer.Option("--offset", metavar="TOPIC=MS", help="Milliseconds to add to the times of a topic; repeatable."),
+]
+Cameras = Annotated[
+    list[str] | None,
+    typer.Option(
+        "--camera",
+        metavar="[TOPIC=]FILE[#NAME]",
+        help="Calibration in place of the recording's: YAML of ROS, Kalibr or OpenCV; repeatable.",
+    ),
+]
+ScaleCamera = Annotated[
+    bool, typer.Option("--scale-camera", help="Scale a calibration for another image size to the images.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 
 
@@ -113,13 +133,17 @@ def inspect(
     times: TimesFile = None,
     times_unit: TimesUnit = "auto",
     tf: TimeFrames = None,
+    clocks: Clocks = None,
+    offsets: Offsets = None,
+    cameras: Cameras = None,
+    scale_camera: ScaleCamera = False,
 ) -> None:
     """Show what is in a recording: streams, cameras, damage, and what is odd about its clocks."""
     from workbench.session import open_any
 
-    with open_any(path, _options(rate, times, times_unit, tf)) as recording:
-        facts = [] if quick else _survey(recording)
-        values = _recording_values(recording, facts)
+    with open_any(path, _options(rate, times, times_unit, tf, clocks, offsets, cameras, scale_camera)) as recording:
+        facts, clocks_found = ([], {}) if quick else _survey(recording)
+        values = _recording_values(recording, facts) | {"clocks": clocks_found}
         if as_json:
             print_json(values)
         else:
@@ -128,13 +152,26 @@ def inspect(
             raise typer.Exit(IN_PART)
 
 
-def _survey(recording: Recording) -> list[dict[str, Any]]:
-    from readers.clock import survey
+def _survey(recording: Recording) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """The oddities of a recording; and by stream how log time stands to header stamps and publish times, ms."""
+    from readers.clock import Lag, examine
 
-    return [
+    def milliseconds(lag: Lag) -> dict[str, Any] | None:
+        if not lag.messages:
+            return None
+        told = {"least_ms": lag.least_ns, "median_ms": lag.median_ns, "greatest_ms": lag.greatest_ns}
+        return {"messages": lag.messages} | {name: ns / 1e6 for name, ns in told.items()}
+
+    found = examine(recording)
+    facts = [
         {"stream": fact.stream, "code": fact.code, "count": fact.count, "sentence": fact.sentence}
-        for fact in survey(recording)
+        for fact in found.facts
     ]
+    lags = {
+        name: {"log_after_header": milliseconds(audit.lag), "log_after_publish": milliseconds(audit.publish_lag)}
+        for name, audit in found.audits.items()
+    }
+    return facts, {name: values for name, values in lags.items() if any(values.values())}
 
 
 def _recording_values(recording: Recording, facts: list[dict[str, Any]]) -> dict[str, Any]:
@@ -175,6 +212,7 @@ def _camera_values(camera: Camera) -> dict[str, Any]:
         "distortion_model": camera.distortion_model,
         "distortion": camera.distortion.tolist(),
         "frame": camera.frame,
+        "source": camera.source,
         "calibrated": camera.calibrated,
     }
 
@@ -193,10 +231,24 @@ def _print_recording(recording: Recording, values: Mapping[str, Any]) -> None:
     print("\n".join(table(heads, rows, right=(2, 3, 4, 5))) if rows else "no streams")
     for name, camera in recording.cameras.items():
         print(f"\ncamera of {shown(name)}: {_camera_text(camera)}")
+    _print_clocks(values["clocks"])
     print_list("notes", values["notes"])
     print_list("not readable", [_unreadable(info) for info in recording.streams if not info.readable])
     print_list("damage", values["damage"])
     print_list("oddities", [f"{fact['stream']}: {fact['sentence']}" for fact in values["facts"]])
+
+
+def _print_clocks(clocks: Mapping[str, Any]) -> None:
+    """Print how late log time is after header stamps and publish times."""
+    rows = [
+        (name, kind, str(lag["messages"]), *(f"{lag[k]:.3f}" for k in ("least_ms", "median_ms", "greatest_ms")))
+        for name, lags in clocks.items()
+        for kind, lag in (("header", lags["log_after_header"]), ("publish", lags["log_after_publish"]))
+        if lag is not None
+    ]
+    if rows:
+        heads = ("log time after", "clock", "messages", "least ms", "median ms", "greatest ms")
+        print("\n" + "\n".join(table(heads, rows, right=(2, 3, 4, 5))))
 
 
 def _unreadable(info: StreamInfo) -> str:
@@ -225,7 +277,9 @@ def _camera_text(camera: Camera) -> str:
     if not camera.calibrated:
         return f"{size}, not calibrated"
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
-    return f"{size}, f {fx:.6g} {fy:.6g}, centre {cx:.6g} {cy:.6g}, distortion {shown(camera.distortion_model)}"
+    source = f", of {shown(camera.source)}" if camera.source else ""
+    lens = shown(camera.distortion_model)
+    return f"{size}, f {fx:.6g} {fy:.6g}, centre {cx:.6g} {cy:.6g}, distortion {lens}{source}"
 
 
 # --------------------------------------------------------------------------------- replay
@@ -298,6 +352,10 @@ def replay(
     times: TimesFile = None,
     times_unit: TimesUnit = "auto",
     tf: TimeFrames = None,
+    clocks: Clocks = None,
+    offsets: Offsets = None,
+    cameras: Cameras = None,
+    scale_camera: ScaleCamera = False,
     as_json: AsJson = False,
 ) -> None:
     """Replay a recording through an estimator; write all it computed, and a summary.
@@ -327,7 +385,7 @@ def replay(
         reference=reference,
         reference_offset_s=reference_offset,
         height=height,
-        options=_options(rate, times, times_unit, tf),
+        options=_options(rate, times, times_unit, tf, clocks, offsets, cameras, scale_camera),
         calibrate=calibrate,
         smooth=smooth,
         raw_images=_one_of(raw_images, ("png", "raw"), "--raw-images"),
@@ -362,7 +420,13 @@ def _replay(request: Request, recording: Recording | None = None) -> Outcome:
     from workbench.session import run
 
     with Bar(request.name or request.preset or request.estimator) as bar:
-        return run(request, recording=recording, on_progress=bar)
+        return run(request, recording=recording, on_progress=bar, on_warnings=_warn)
+
+
+def _warn(texts: Sequence[str]) -> None:
+    """Tell what is odd about the clocks before the estimator runs."""
+    for text in texts:
+        print(f"warning: {shown(text)}", file=sys.stderr, flush=True)
 
 
 def _status(outcome: Outcome) -> int:
@@ -591,6 +655,133 @@ def view_command(files: Sequence[Path], *, web: bool) -> list[str]:
     """The command that opens the viewer on these files, reachable from this machine only."""
     command = [sys.executable, "-m", "rerun", *map(str, files), "--bind", "127.0.0.1"]
     return [*command, "--web-viewer"] if web else command
+
+
+# ----------------------------------------------------------------------------------- sync
+
+
+@app.command(
+    short_help="How far the clocks of cameras, IMUs and odometers are apart.",
+    epilog=examples(
+        "workbench sync mission.bag",
+        "workbench sync mission.bag --image /camera/image_raw --with /imu --picture sync.png",
+        "workbench replay mission.bag --offset /camera/image_raw=-31.5",
+    ),
+)
+def sync(
+    path: RecordingPath,
+    images: Annotated[
+        list[str] | None, typer.Option("--image", metavar="TOPIC", help="Images [all]; repeatable.")
+    ] = None,
+    sensors: Annotated[
+        list[str] | None, typer.Option("--with", metavar="TOPIC", help="IMU or odometry [all]; repeatable.")
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option("--from", metavar="T", help="Begin: seconds after the first frame, ns, or ISO 8601.")
+    ] = None,
+    stop: Annotated[str | None, typer.Option("--to", metavar="T", help="End (excluded), likewise.")] = None,
+    max_offset: Annotated[float, typer.Option(metavar="S", help="How far the clocks may be apart.")] = 1.0,
+    picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the correlations.")] = None,
+    clocks: Clocks = None,
+    offsets: Offsets = None,
+    as_json: AsJson = False,
+) -> None:
+    """Tell by how much the times of each camera are to be moved to fit each IMU and odometer, and how surely.
+
+    The turn of the whole image is held against rates of turn, the way of the image against speeds. It takes motion that
+    changes: turns, or starts and stops. Exit status 3 where no offset could be told.
+    """
+    from readers.streams import StreamError
+    from workbench.session import Progress, open_any
+    from workbench.sync import draw
+    from workbench.sync import sync as estimated
+
+    if not 0 < max_offset < float("inf"):
+        raise StreamError(f"--max-offset {max_offset:g}: give a positive number of seconds")
+    with open_any(path, _options(None, None, "auto", None, clocks, offsets)) as recording, Bar("sync") as bar:
+        pairs = estimated(
+            recording,
+            images=images or (),
+            sensors=sensors or (),
+            start=start,
+            stop=stop,
+            max_offset_s=max_offset,
+            on_frame=lambda done, total: bar(Progress(done, None if total < 0 else total, 0)),
+        )
+    if picture is not None:
+        draw(pairs, picture)
+    if as_json:
+        print_json({"pairs": [_pair_values(pair) for pair in pairs]})
+    else:
+        for pair in pairs:
+            told = pair.offset
+            print(f"{shown(pair.camera)} and {shown(pair.sensor)}: ", end="")
+            if told.determined:
+                print(
+                    f"{told.offset_ns / 1e6:+.2f} ms (1σ {1e3 * told.sigma_s:.2f} ms) are to be added to the camera's "
+                    f"times, by {pair.signals} (correlation {told.correlation:.3f}): {shown(pair.option)}"
+                )
+            else:
+                print(told.reason)
+    raise typer.Exit(0 if any(pair.offset.determined for pair in pairs) else IN_PART)
+
+
+def _pair_values(pair: Pair) -> dict[str, Any]:
+    told = pair.offset
+    return {
+        "camera": pair.camera,
+        "sensor": pair.sensor,
+        "signals": pair.signals,
+        "determined": told.determined,
+        "reason": told.reason,
+        "offset_ms": told.offset_ns / 1e6 if told.determined else None,
+        "sigma_ms": 1e3 * told.sigma_s,
+        "correlation": told.correlation,
+        "scale": told.scale,
+        "option": pair.option,
+    }
+
+
+# --------------------------------------------------------------------------------- verify
+
+
+@app.command(
+    short_help="Check that the files of a run are what was written.",
+    epilog=examples(
+        "workbench verify results/mission",
+        "workbench verify results/mission/best.rrd --json",
+        "cd results/mission && sha256sum -c best.sha256",
+    ),
+)
+def verify(
+    runs: Annotated[
+        list[Path], typer.Argument(metavar="RUN...", help="RUN.rrd files, or folders of results", show_default=False)
+    ],
+    as_json: AsJson = False,
+) -> None:
+    """Hold the files of runs against their manifests, RUN.sha256: every byte, and the rows of every entity.
+
+    Exit status 0: all is as it was written; 3: something differs, which is named; 2: there is no manifest to go by.
+    """
+    from workbench import manifest
+
+    found = {
+        str(folder / name): manifest.verify(folder, name) for run in runs for folder, name in manifest.runs_of(run)
+    }
+    good = not any(check.problems for checks in found.values() for check in checks)
+    if as_json:
+        told = {
+            run: {c.name: {"rows": c.rows, "problems": list(c.problems)} for c in checks}
+            for run, checks in found.items()
+        }
+        print_json({"good": good, "runs": told})
+    else:
+        for run, checks in found.items():
+            print(shown(run))
+            for check in checks:
+                counted = f", {check.rows} rows" if check.rows else ""
+                print(f"  {shown(check.name)}: {'; '.join(map(shown, check.problems)) or 'as written' + counted}")
+    raise typer.Exit(0 if good else IN_PART)
 
 
 # ----------------------------------------------------------------------------------- demo
@@ -908,7 +1099,16 @@ def what_if(
 # -------------------------------------------------------------------------------- helpers
 
 
-def _options(rate: float | None, times: Path | None, unit: str, frames: Sequence[str] | None) -> ReadOptions:
+def _options(
+    rate: float | None,
+    times: Path | None,
+    unit: str,
+    frames: Sequence[str] | None,
+    clocks: Sequence[str] | None = None,
+    offsets: Sequence[str] | None = None,
+    cameras: Sequence[str] | None = None,
+    scale_camera: bool = False,
+) -> ReadOptions:
     from readers.streams import ReadOptions, StreamError
 
     if rate is not None and not 0 < rate < float("inf"):
@@ -924,7 +1124,51 @@ def _options(rate: float | None, times: Path | None, unit: str, frames: Sequence
         times_file=times,
         times_unit=_one_of(unit, ("auto", "s", "ms", "us", "ns"), "--times-unit"),
         pose_frames=tuple(pairs),
+        clocks=_clocks(clocks or ()),
+        offsets_ns=_offsets(offsets or ()),
+        cameras=tuple(map(_camera_file, cameras or ())),
+        scale_cameras=scale_camera,
     )
+
+
+def _camera_file(text: str) -> CameraFile:
+    """A file of a camera, with the stream that it is for before it and the camera's name behind it."""
+    from readers.streams import CameraFile
+
+    if Path(text).is_file():
+        return CameraFile(Path(text))
+    topic, _, rest = text.rpartition("=")
+    file, mark, name = rest.rpartition("#")
+    return CameraFile(Path(file if mark else rest), topic, name if mark else "")
+
+
+def _clocks(texts: Sequence[str]) -> tuple[tuple[str, Clock], ...]:
+    """Topics and their clocks."""
+    from readers.streams import Clock, StreamError
+
+    found = {}
+    for text in texts:
+        topic, _, clock = text.rpartition("=")
+        if not topic or clock not in set(Clock):
+            raise StreamError(f"--clock {text}: write a topic and header, log or publish, such as --clock /imu=log")
+        found[topic] = Clock(clock)
+    return tuple(found.items())
+
+
+def _offsets(texts: Sequence[str]) -> tuple[tuple[str, int], ...]:
+    """Topics and their offsets in ns."""
+    from readers.streams import StreamError
+
+    found = {}
+    for text in texts:
+        topic, _, number = text.rpartition("=")
+        try:
+            found[topic] = round(float(number) * 1e6)
+        except (ValueError, OverflowError):
+            topic = ""
+        if not topic:
+            raise StreamError(f"--offset {text}: write a topic and milliseconds, such as --offset /camera=-12.5")
+    return tuple(found.items())
 
 
 def _one_of(text: str, known: Sequence[str], option: str) -> str:

@@ -20,6 +20,7 @@ import numpy as np
 
 from pipelines.evaluation import Trajectory, associate
 from pipelines.geometry import local_enu
+from readers.clock import StreamAudit
 from readers.streams import (
     UNKNOWN_COV6,
     UNKNOWN_QUAT,
@@ -41,6 +42,8 @@ from readers.streams import (
 from workbench.settings import Layer, Resolved, validated
 
 NONE = "none"
+DEPTH = "/compressedDepth"
+"""How topics of compressed depth images end: they are images that no picture is in."""
 SECOND_NS = 1_000_000_000
 MARGIN_NS = 2 * SECOND_NS
 EDGE_BYTES = 1 << 20
@@ -135,6 +138,27 @@ def _no_frame(recording: Recording, stream: str) -> StreamError:
     return StreamError(f"{recording.path}: {stream} has no frame in this window; its messages lie {span}")
 
 
+LOOK_NS = 10 * SECOND_NS
+CLOCK_FACTS = frozenset(
+    ("clock_jump", "duplicate_stamp", "foreign_publish_time", "foreign_stamp", "frozen_stamp", "gap", "out_of_order")
+) | {"stamp_rollover", "zero_stamp"}
+
+
+def clock_warnings(recording: Recording, streams: Sequence[str], first_ns: int, stop_ns: int | None) -> list[str]:
+    """What is odd about the clocks of some streams in the first seconds of a window, one sentence each.
+
+    A simulated mission is not looked at: its oddities are its own, and looking renders it.
+    """
+    if recording.identity:
+        return []
+    last_ns = first_ns + LOOK_NS if stop_ns is None else min(stop_ns, first_ns + LOOK_NS)
+    audits = {name: StreamAudit(name) for name in streams}
+    for sample in while_readable(recording.read(list(streams), first_ns, last_ns)):
+        audits[sample.stream].add(sample)
+    facts = [fact for audit in audits.values() for fact in audit.facts() if fact.code in CLOCK_FACTS]
+    return [f"{fact.stream}, first {LOOK_NS // SECOND_NS} s: {fact.sentence}" for fact in facts]
+
+
 # -------------------------------------------------------------------------------- streams
 
 
@@ -152,8 +176,9 @@ def choose_images(recording: Recording, wanted: str | None) -> str:
     if wanted is not None:
         return of_kind(recording, wanted, (StreamKind.IMAGE,), "--image")
     found = recording.of_kind(StreamKind.IMAGE)
-    if len(found) == 1:
-        return found[0].name
+    pictures = [info for info in found if not info.name.endswith(DEPTH)]
+    if len(pictures) == 1:
+        return pictures[0].name
     if found:
         raise StreamError(f"{recording.path}: several image streams: {names(found)}; choose one with --image")
     raise StreamError(f"{recording.path}: no stream of images that can be read; the streams are: {kinds(recording)}")
@@ -373,18 +398,39 @@ def _focal(settings: Any, camera: Camera | None, size_px: tuple[int, int]) -> tu
     """The focal length, what it comes from, and what to look out for."""
     if settings.focal_px is not None:
         return settings.focal_px, f"focal length {settings.focal_px:g} px, as given", []
-    if camera is None or not camera.calibrated:
+    if camera is None:
         return None, "", []
+    if not camera.calibrated:
+        return (
+            None,
+            "",
+            ["the calibration is empty (K has no focal length): give --camera FILE or focal_px"],
+        )
     made_for = (camera.width_px, camera.height_px)
     if made_for not in (size_px, (0, 0)):
         note = (
             f"the calibration is for {made_for[0]} x {made_for[1]} px, but the images are {size_px[0]} x "
-            f"{size_px[1]} px: it is not used; give focal_px"
+            f"{size_px[1]} px: it is not used; give focal_px, or --scale-camera if the images were resized"
         )
         return None, "", [note]
-    notes = ["lens distortion is not removed from the images"] if np.any(camera.distortion) else []
+    notes = [camera_sentence(camera)]
+    notes += ["lens distortion is not removed from the images"] if np.any(camera.distortion) else []
     focal = float(camera.matrix[0, 0])
-    return focal, f"focal length {focal:.6g} px of the log's calibration", notes
+    return focal, f"focal length {focal:.6g} px of {source_of(camera)}", notes
+
+
+def source_of(camera: Camera) -> str:
+    """Where a camera comes from."""
+    return camera.source or "the log's calibration"
+
+
+def camera_sentence(camera: Camera) -> str:
+    """The model of a camera and where it comes from."""
+    (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
+    size = f"{camera.width_px} x {camera.height_px} px, " if camera.width_px else ""
+    lens = ", ".join(f"{k:.6g}" for k in camera.distortion)
+    bent = f"distortion {camera.distortion_model} ({lens})" if np.any(camera.distortion) else "no distortion"
+    return f"camera: {size}f {fx:.6g} {fy:.6g}, centre {cx:.6g} {cy:.6g}, {bent}, of {source_of(camera)}"
 
 
 def _height(settings: Any, recording: Recording, stream: str) -> tuple[dict[str, Any], str]:

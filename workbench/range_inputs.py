@@ -26,7 +26,7 @@ from readers.streams import (
     StreamKind,
     TextSample,
 )
-from workbench.inputs import NONE, Reference, choose_images, kinds, names, of_kind
+from workbench.inputs import NONE, Reference, camera_sentence, choose_images, kinds, names, of_kind
 from workbench.inputs import load_reference as load_any_reference
 from workbench.settings import Layer, Resolved, validated
 
@@ -211,7 +211,7 @@ def with_camera(
     notes = []
     if settings.focal_px is None:
         values = _intrinsics(camera)
-        notes.append(f"focal length {camera.matrix[0, 0]:.6g} px of the log's calibration")
+        notes.append(camera_sentence(camera))
     if np.isfinite(camera.body_t_camera).all():
         turn, place = camera.body_t_camera[:3, :3], camera.body_t_camera[:3, 3]
         values["camera_quat_xyzw"] = tuple(Rotation.from_matrix(turn).as_quat().tolist())

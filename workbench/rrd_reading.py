@@ -10,6 +10,7 @@ import subprocess
 import sys
 import tempfile
 import warnings
+from collections import Counter
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -263,12 +264,30 @@ def stored_images(path: Path, entity: str, frames: Sequence[int]) -> Iterator[tu
         batch = chunk.to_record_batch()
         if "frame" not in batch.schema.names:
             continue
-        numbers = batch.column("frame").to_numpy()
-        for at in np.flatnonzero(np.isin(numbers, frames)).tolist():
+        logged = numbers(batch.column("frame"))
+        for at in np.flatnonzero(np.isin(logged, frames)).tolist():
             row = batch.slice(at, 1)
             found = {name: row.column(name)[0].as_py() for name in row.schema.names if ":" in name}
             if any(found.values()):
-                yield int(numbers[at]), found
+                yield int(logged[at]), found
+
+
+def stored_rows(path: Path) -> dict[str, int]:
+    """How many rows each entity holds, static ones included, counted over the data and not by the footer.
+
+    Raises:
+        RecordingError: the file cannot be read whole.
+    """
+    rows: Counter[str] = Counter()
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        try:
+            for chunk in RrdReader(path).stream():
+                rows[chunk.entity_path] += chunk.num_rows
+        except (RuntimeError, ValueError, OSError) as error:
+            reason = (str(error).splitlines() or ["no reason given"])[0]
+            raise RecordingError(path, f"cannot be read whole ({reason})", "replay the recording again") from error
+    return dict(rows)
 
 
 # ------------------------------------------------------------------------- whole files

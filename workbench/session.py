@@ -1,7 +1,8 @@
 """One replay, from a path to a run folder: open, choose, replay, judge, write.
 
 The run folder holds, once per mission, `sensors.rrd` (with `sensors.toml`, which says what is in it), and per
-run `RUN.rrd`, `RUN.toml` (settings, versions, input digest, window, summary) and `RUN.tum` (trajectory).
+run `RUN.rrd`, `RUN.toml` (settings, versions, input digest, window, summary), `RUN.tum` (trajectory) and `RUN.sha256`
+(the manifest of these files, see `workbench.manifest`).
 An interrupt is noticed between two frames; everything up to there is written, the files are closed, and
 RUN.toml says so. Nothing of the wall clock goes into the files.
 """
@@ -46,7 +47,7 @@ from readers.streams import (
     StreamError,
     StreamInfo,
 )
-from workbench import inputs, range_inputs
+from workbench import inputs, manifest, range_inputs
 from workbench.checkpoints import CHECKPOINT_FRAMES, CheckpointError, CheckpointWriter
 from workbench.range_account import RangeAccount
 from workbench.range_smoothing import Smoothing
@@ -145,11 +146,12 @@ class Writers(NamedTuple):
     Both are called with the file and, by name, the `recording_id`, the `run`, the name of its `estimator` and its
     `step_type`; `sensors` with `raw_images` as well, `run` with `settings_text`, `ground` [n, 2], positions of the
     reference in m that the map shows (None where there are none, or the path is not in metres), and `scene`, what
-    the drawing of this estimator's steps needs to know beyond them.
+    the drawing of this estimator's steps needs to know beyond them. `rows` counts the rows of a written file.
     """
 
     sensors: Callable[..., SensorLog]
     run: Callable[..., RunLog]
+    rows: manifest.CountRows = manifest.stored_rows
 
 
 def rerun_writers() -> Writers:
@@ -204,10 +206,11 @@ def open_any(path: Path, options: ReadOptions) -> Recording:
         SettingsError: it is a scenario that cannot be.
     """
     from readers import open_recording
+    from readers.adjusted import adjusted
     from workbench.scenarios import is_scenario, open_scenario
 
     if is_scenario(path):
-        return open_scenario(path)
+        return adjusted(open_scenario(path), options)
     return open_recording(path, options)
 
 
@@ -216,6 +219,7 @@ def run(
     *,
     recording: Recording | None = None,
     on_progress: Callable[[Progress], None] | None = None,
+    on_warnings: Callable[[Sequence[str]], None] | None = None,
     writers: Writers | None = None,
 ) -> Outcome:
     """Replay a recording and write its run folder.
@@ -224,6 +228,7 @@ def run(
         request: what is asked for.
         recording: the recording, where it is no file (a simulated mission); else `request.path` is opened.
         on_progress: called after every frame.
+        on_warnings: called before the first frame with what is odd about the clocks in its first seconds, if anything.
         writers: the classes that write the files; those of `workbench.rrd` by default.
 
     Raises:
@@ -240,6 +245,8 @@ def run(
         raise SettingsError(f"--stride {request.stride}: must be 1 or more")
     with recording or open_any(request.path, request.options) as opened:
         session = _prepare(request, opened, estimator, resolved, name, preset)
+        if on_warnings is not None and (warnings := session.clock_warnings()):
+            on_warnings(warnings)
         with Interrupt() as interrupt:
             return session.replay(writers or rerun_writers(), interrupt, on_progress)
 
@@ -401,20 +408,20 @@ class _Audited(Recording):
 
     def __init__(self, inner: Recording) -> None:
         self.path, self.format, self.notes = inner.path, inner.format, inner.notes
-        self._inner = inner
+        self.inner = inner
         self.audits: dict[str, StreamAudit] = {}
 
     @property
     def streams(self) -> tuple[StreamInfo, ...]:
-        return self._inner.streams
+        return self.inner.streams
 
     def read(
         self, streams: Sequence[str] | None = None, start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Sample]:
-        return self._audited(self._inner.read(streams, start_ns, stop_ns))
+        return self._audited(self.inner.read(streams, start_ns, stop_ns))
 
     def arrivals(self, streams: Sequence[str] | None = None) -> Iterator[Sample]:
-        return self._audited(self._inner.arrivals(streams))
+        return self._audited(self.inner.arrivals(streams))
 
     def _audited(self, samples: Iterator[Sample]) -> Iterator[Sample]:
         for sample in samples:
@@ -424,7 +431,7 @@ class _Audited(Recording):
             yield sample
 
     def count_before(self, stream: str, t_ns: int) -> int:
-        return self._inner.count_before(stream, t_ns)
+        return self.inner.count_before(stream, t_ns)
 
     def facts(self) -> list[str]:
         """The oddities of what was read, one sentence each."""
@@ -432,7 +439,7 @@ class _Audited(Recording):
 
     def damage_lines(self) -> list[str]:
         """What of the file was found damaged so far."""
-        return [str(damage) for damage in self._inner.damage]
+        return [str(damage) for damage in self.inner.damage]
 
 
 class Account(Protocol):
@@ -593,6 +600,12 @@ class _Session:
 
     # ---- the loop
 
+    def clock_warnings(self) -> list[str]:
+        """What is odd about the clocks of the streams that are used, in the first seconds of the window."""
+        recording, chosen = self.recording.inner, self.chosen
+        first_ns = inputs.first_time(recording, chosen.frames, chosen.start_ns, chosen.stop_ns)
+        return inputs.clock_warnings(recording, [chosen.frames, *chosen.others], first_ns, chosen.stop_ns)
+
     def replay(self, writers: Writers, interrupt: Interrupt, on_progress: Callable[[Progress], None] | None) -> Outcome:
         """Replay, judge and write; RUN.toml says how it ended."""
         self._make_folder()
@@ -602,11 +615,14 @@ class _Session:
             self._write_toml({"complete": False, "summary": {"interrupted": True}})
             raise
         self._write_toml({"complete": True, "summary": summary})
+        made = manifest.taken(self.folder, self.name, writers.rows)
+        _replace(manifest.file_of(self.folder, self.name), made.text())
         return Outcome(self.folder, self._file("rrd"), self.folder / "sensors.rrd", summary)
 
     def _make_folder(self) -> None:
         try:
             self.folder.mkdir(parents=True, exist_ok=True)
+            manifest.file_of(self.folder, self.name).unlink(missing_ok=True)
             self._write_toml({"complete": False})
         except OSError as error:
             problem = f"no results can be written there ({error.strerror or error})"
@@ -798,6 +814,7 @@ class _Session:
         return {
             "format": FORMAT,
             "digest": self.digest,
+            **{k: v for k, v in option_values(self.request.options).items() if k in ("clocks", "offsets_ms")},
             "image_stream": self.chosen.shown or self.chosen.frames,
             "frame_stream": self.chosen.frames,
             "streams": self._kept_streams(),
@@ -815,8 +832,10 @@ class _Session:
 
     @property
     def _order(self) -> str:
-        """In what order the estimator gets the samples."""
-        return "stamps" if self.chosen.latency is None else self.chosen.latency.order
+        """In what order and with which times the estimator gets the samples, in words."""
+        order = "stamps" if self.chosen.latency is None else self.chosen.latency.order
+        times = {k: v for k, v in option_values(self.request.options).items() if k in ("clocks", "offsets_ms")}
+        return f"{order}; {times}" if times else order
 
     def _kept_streams(self) -> list[str]:
         """The streams whose samples the sensors' file holds: this run's, and those of the runs before it."""
@@ -843,6 +862,7 @@ class _Session:
                 "preset": self.preset,
                 "recording": str(self.request.path),
                 "digest": self.digest,
+                **option_values(self.request.options),
                 "image_stream": self.chosen.frames,
                 "other_streams": list(self.chosen.others),
                 "order": self._order,
@@ -887,6 +907,20 @@ def calibration(settings: Any, evaluation: Evaluation) -> dict[str, Any]:
         advice = "not to be used: the two do not agree, so that the path's shape is wrong, not only its scale"
     sentence = f"{key} = {fit:.6g} by least squares, {ratio:.6g} by path length; {advice}"
     return found | {"sentence": sentence}
+
+
+def option_values(options: ReadOptions) -> dict[str, Any]:
+    """The clocks, offsets and cameras that were asked for, as RUN.toml keeps them; nothing where none was."""
+    values: dict[str, Any] = {}
+    if options.clocks:
+        values["clocks"] = [f"{topic}={clock}" for topic, clock in options.clocks]
+    if options.offsets_ns:
+        values["offsets_ms"] = [f"{topic}={ns / 1e6:.6f}" for topic, ns in options.offsets_ns]
+    if options.cameras:
+        values["cameras"] = [f"{c.topic}={c.path}#{c.name}" for c in options.cameras]
+    if options.scale_cameras:
+        values["scale_cameras"] = True
+    return values
 
 
 def versions() -> dict[str, str]:

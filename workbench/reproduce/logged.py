@@ -29,8 +29,8 @@ def logged(
     Raises:
         KeyboardInterrupt: it was stopped; the log goes as far as it came.
     """
-    sensors, run = session.rerun_writers()
-    writers = session.Writers(sensors, lambda *args, **options: _Noted(run(*args, **options), take))
+    usual = session.rerun_writers()
+    writers = usual._replace(run=lambda *args, **options: _Noted(usual.run(*args, **options), take))
     outcome = session.run(request, recording=recording, on_progress=lambda _: tick(), writers=writers)
     if outcome.summary["interrupted"]:
         raise KeyboardInterrupt

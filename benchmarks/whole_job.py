@@ -1,0 +1,94 @@
+"""The whole job against decoding alone: from a log of JPEG images to the files of a run.
+
+    python benchmarks/whole_job.py [--frames 600] [--passes 3] [--raw]
+
+The log is an MCAP file of a simulated drive over gravel, 512 x 512. Decoding alone reads it and decodes every image to
+grey in as many threads as there are cores; the whole job replays it with the preset `best` and logs everything. The
+best of the passes is told, in frames a second by the clock and in CPU time a frame, with the share of the manifest.
+Bar: the whole job at 80 % of the rate of decoding alone. Run it on a machine that has nothing else to do.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import tempfile
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from pipelines.simulation.mission import nadir_mission
+from pipelines.simulation.surfaces import gravel
+from pipelines.simulation.trajectories import drive, figure_eight
+from readers import open_recording
+from readers.streams import ImageSample
+from workbench import manifest
+from workbench.session import Request, run
+from workbench.writers import write
+
+BAR = 0.8
+
+
+def timed(work: Callable[[], Any]) -> tuple[float, float]:
+    """Seconds by the clock, and of CPU."""
+    wall_s, cpu_s = time.perf_counter(), time.process_time()
+    work()
+    return time.perf_counter() - wall_s, time.process_time() - cpu_s
+
+
+def made_log(file: Path, frames: int, raw: bool) -> None:
+    """Write the log."""
+    rng = np.random.default_rng(0)
+    mission = nadir_mission(gravel(1024, rng), drive(figure_eight(), frames, speed_mps=0.51, rng=rng))
+    write(mission, file, image_format="stored" if raw else "jpeg")
+
+
+def decode(file: Path, threads: int) -> None:
+    """Decode all images, at most eight under way a thread."""
+    with open_recording(file) as recording, ThreadPoolExecutor(threads) as pool:
+        waiting: deque[Future[Any]] = deque()
+        for sample in recording.read():
+            if isinstance(sample, ImageSample):
+                waiting.append(pool.submit(sample.grey))
+                if len(waiting) > 8 * threads:
+                    waiting.popleft().result()
+        for future in waiting:
+            future.result()
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser()
+    parser.add_argument("--frames", type=int, default=600)
+    parser.add_argument("--passes", type=int, default=3)
+    parser.add_argument("--raw", action="store_true", help="raw images instead of JPEG")
+    chosen = parser.parse_args()
+    cores = os.cpu_count() or 1
+    with tempfile.TemporaryDirectory() as name:
+        folder = Path(name)
+        log = folder / "log.mcap"
+        made_log(log, chosen.frames, chosen.raw)
+        request = Request(path=log, out=folder / "run", overrides=("metres_per_px=0.001",))
+        run(request)  # compiles what it needs
+        alone = min(timed(lambda: decode(log, cores)) for _ in range(chosen.passes))
+        whole = []
+        for k in range(chosen.passes):
+            fresh = Request(path=log, out=folder / f"run{k}", overrides=request.overrides)
+            whole.append(timed(lambda fresh=fresh: run(fresh)))  # type: ignore[misc]
+        listed = timed(lambda: manifest.taken(folder / "run", "best"))
+        best = min(whole)
+        for title, (wall_s, cpu_s) in (("decoding alone", alone), ("whole job", best), ("of it, manifest", listed)):
+            rate, cost = chosen.frames / wall_s, 1e3 * cpu_s / chosen.frames
+            print(f"{title:16} {rate:9.1f} frames/s  {cost:7.3f} ms of CPU a frame")
+        share = alone[0] / best[0]
+        verdict = "met" if share >= BAR else "not met"
+        print(f"whole job at {share:.0%} of decoding alone on {cores} cores (bar {BAR:.0%}: {verdict})")
+
+
+if __name__ == "__main__":
+    main()
