@@ -74,7 +74,7 @@ class Area:
         return self._zones(self.clearance_m)
 
     def room(self, run_out_m: float, zone_room_m: float = 0.0) -> BaseGeometry:
-        """The inside of the outer border, widened by `run_out_m`, without the zones, widened too; both with clearance.
+        """The inside of the outer border, widened by `run_out_m`, without the widened zones; both with clearance.
 
         Corners stay sharp when moved, so that no distance gets smaller than it should.
         """
