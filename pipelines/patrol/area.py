@@ -49,8 +49,8 @@ class Area:
             raise ValueError(f"a clearance of {self.clearance_m:g} m: it must be 0 or more")
         if self.allowed.is_empty:
             raise ValueError(
-                "clearance, room for turns and no-go zones leave no place to fly: take less clearance, smaller turns or "
-                "more run-out"
+                "clearance, room for turns and no-go zones leave no place to fly: take less clearance, smaller turns "
+                "or more run-out"
             )
 
     @classmethod

@@ -34,7 +34,7 @@ def radii(outermost_m: float, step_m: float) -> Floats:
     """Radii [n] of the circles R - k w that are left, from the outermost inwards."""
     if not (outermost_m > 0 and step_m > 0):
         raise ValueError(f"circles from {outermost_m:g} m inwards every {step_m:g} m: both must be positive")
-    return outermost_m - step_m * np.arange(math.ceil(outermost_m / step_m - 1e-9))
+    return np.asarray(outermost_m - step_m * np.arange(math.ceil(outermost_m / step_m - 1e-9)))
 
 
 def spiral_length(outermost_m: float, step_m: float) -> float:
@@ -116,7 +116,7 @@ def pulled_in() -> list[Row]:
     """The spirals with the outermost circle half a swath farther in, so that the strip's edge is on the circle."""
     half = SIDE_M / 2
     return [
-        _spiral_row("spiral 1, pulled in", half * PRINTED_ROOT - SWATH_M / 2, math.nan, "half a swath inside"),
+        _spiral_row("spiral 1, pulled in", half * math.sqrt(2) - SWATH_M / 2, math.nan, "half a swath inside"),
         _spiral_row("spiral 2, pulled in", half - SWATH_M / 2, math.nan, "half a swath inside"),
     ]
 
