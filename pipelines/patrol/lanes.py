@@ -28,6 +28,8 @@ Floats = NDArray[np.float64]
 
 CRUMB = 1e-5
 """What is left out counts from this share of the smaller of the target and a square of a swath."""
+ARC_RAD = math.radians(3.0)
+"""Arcs become chords of at most that angle."""
 SHORTEST = 1e-3
 """A pass is at least that share of a swath long."""
 
@@ -59,7 +61,28 @@ class Strip:
 
     def swept(self, line: Floats) -> BaseGeometry:
         """What a pass [n, 2] sweeps; in its corners the camera turns with the vehicle."""
-        return LineString(_lengthened(line, self.along_m / 2)).buffer(self.swath_m / 2, cap_style="flat", quad_segs=16)
+        return swept(_lengthened(line, self.along_m / 2), self.swath_m)
+
+
+def swept(line: Floats, width_m: float) -> BaseGeometry:
+    """What a bar across the way sweeps along a polyline [n, 2], turning about its middle in the corners.
+
+    Made of one rectangle a stretch and two sectors a corner: a polyline's buffer leaves holes where the line bends
+    within less than half the width.
+    """
+    ways = np.diff(line, axis=0)
+    ways = ways / np.hypot(*ways.T)[:, None]
+    aside = width_m / 2 * np.column_stack([-ways[:, 1], ways[:, 0]])
+    start, stop = line[:-1], line[1:]
+    shapes = shapely.polygons(np.stack([start + aside, stop + aside, stop - aside, start - aside], axis=1)).tolist()
+    headings = np.arctan2(ways[:, 1], ways[:, 0])
+    turns = (np.diff(headings) + np.pi) % (2 * np.pi) - np.pi
+    for corner, heading, turn in zip(line[1:-1], headings[:-1].tolist(), turns.tolist(), strict=True):
+        if abs(turn) > 1e-9:
+            angle = heading + np.pi / 2 + turn * np.linspace(0, 1, 2 + int(abs(turn) / ARC_RAD))
+            fan = width_m / 2 * np.column_stack([np.cos(angle), np.sin(angle)])
+            shapes += [shapely.Polygon(np.concatenate([[corner], corner + side * fan])) for side in (1, -1)]
+    return shapely.union_all(shapes)
 
 
 def _lengthened(line: Floats, by_m: float) -> Floats:

@@ -320,7 +320,7 @@ def _arcs_s(vehicle: Vehicle, lines: Sequence[Floats]) -> Floats:
     """Time [2n, 2n] from the end of a pass to the begin of another, in arcs, as if there were no wind."""
     headings = [math.atan2(*(line[1] - line[0])[::-1]) for line in lines]
     ends = np.array([[*line[end], h] for line, h in zip(lines, headings, strict=True) for end in (0, -1)])
-    turned = [*ends, 0.0, 0.0, math.pi]
+    turned = ends + np.array([0.0, 0.0, math.pi])
     begin = np.arange(len(ends)) % 2 == 0
     leaving = np.where(begin[:, None], turned, ends)
     entering = np.where(begin[:, None], ends, turned)

@@ -10,11 +10,10 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-import shapely
 from numpy.typing import NDArray
 
 from pipelines.patrol.area import Area
-from pipelines.patrol.lanes import Strip, lane_offsets
+from pipelines.patrol.lanes import Strip, lane_offsets, swept
 
 Floats = NDArray[np.float64]
 
@@ -27,7 +26,7 @@ PRINTED: Mapping[str, tuple[float, float, float]] = {
     "spiral 2": (756.0, 7_850.0, 4.2),
 }
 """Table 2: length in m, area in m², time in minutes."""
-CHORD_M = 0.1
+CHORD_M = 0.5
 
 
 def radii(outermost_m: float, step_m: float) -> Floats:
@@ -53,12 +52,6 @@ def spiral(centre_m: tuple[float, float], outermost_m: float, step_m: float) -> 
         found.append(radius * np.column_stack([np.cos(angle), np.sin(angle)]))
     found.append(np.zeros((1, 2)))
     return np.asarray(np.concatenate(found) + centre_m)
-
-
-def archimedean_length(outermost_m: float, pitch_m: float) -> float:
-    """Length of the spiral r = p φ/2π up to R: p/4π (φ √(1 + φ²) + asinh φ), φ = 2π R/p."""
-    phi = 2 * math.pi * outermost_m / pitch_m
-    return pitch_m / (4 * math.pi) * (phi * math.hypot(1, phi) + math.asinh(phi))
 
 
 def paper_snake(side_m: float = SIDE_M, swath_m: float = SWATH_M) -> Floats:
@@ -139,14 +132,14 @@ def _spiral_row(name: str, outermost_m: float, circle_m2: float, circle: str) ->
 
 
 def _row(name: str, length_m: float, area_m2: float, way: Floats, reading: str) -> Row:
-    swept = shapely.LineString(way).buffer(SWATH_M / 2, cap_style="flat", quad_segs=64)
-    inside = float(swept.intersection(Area.square(SIDE_M).target).area)
+    strip = swept(way, SWATH_M)
+    inside = float(strip.intersection(Area.square(SIDE_M).target).area)
     return Row(
         name=name,
         length_m=length_m,
         area_m2=area_m2,
         time_min=length_m / SPEED_MPS / 60,
-        swept_m2=float(swept.area),
+        swept_m2=float(strip.area),
         square_share=inside / SIDE_M**2,
         useful_m2_per_m=inside / length_m,
         reading=reading,

@@ -177,11 +177,16 @@ def _track(recording: Recording, asked: Asked, origin: Origin | None) -> Track:
     t_ns, kept = np.unique(t_ns, return_index=True)
     position, quats = position[kept], quats[kept]
     oriented = bool(np.isfinite(quats).all() and (np.linalg.norm(quats, axis=1) > 0.5).all())
-    turns = Rotation.from_quat(quats) if oriented else Rotation.from_euler("z", _courses(position[:, :2]))
+    turns = Rotation.from_quat(quats) if oriented else _about_z(_courses(position[:, :2]))
     how = "attitudes as recorded" if oriented else "level, heading where it travels: no attitude is recorded"
-    turns = turns * Rotation.from_euler("z", asked.yaw_rad)
+    turns = turns * _about_z(np.array([asked.yaw_rad]))
     note = f"places of {stream}, {len(t_ns)} of them; {how}"
     return Track(t_ns, position, turns.as_matrix(), origin if fixes else None, (note,))
+
+
+def _about_z(angles_rad: Floats) -> Rotation:
+    """Rotations [n] about the vertical."""
+    return Rotation.from_rotvec(np.outer(angles_rad, [0.0, 0.0, 1.0]))
 
 
 def _courses(points: Floats) -> Floats:

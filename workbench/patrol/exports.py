@@ -216,7 +216,7 @@ def scenario(sheet_plan: Plan, flight: Flight, *, name: str, height_m: float, or
         "camera": {"height_m": height_m, "timing": {"rate_hz": 10.0}},
         "ground": {"metres_per_px": height_m / 500},
         "reference": {},
-        "truth": {},
+        "truth": {"rate_hz": 20.0},
     }
     if origin is not None:
         (latitude, longitude, altitude) = origin.geodetic(flight.points[:1])[0].tolist()
