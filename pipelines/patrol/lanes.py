@@ -166,7 +166,7 @@ def best_direction(area: Area, strip: Strip) -> float:
     Candidates are the directions of all sides: a convex area is narrowest across one of them.
     """
     outline = area.polygon.convex_hull
-    sides = np.concatenate([_sides(part) for part in (outline, *parts(area.allowed))])
+    sides = np.concatenate([_sides(part) for part in (outline, *parts(area.polygon))])
     angles = np.unique(np.round(np.arctan2(sides[:, 1], sides[:, 0]) % math.pi, 9) % round(math.pi, 9))
 
     def cost(angle: float) -> tuple[int, float]:

@@ -279,6 +279,8 @@ class _Row:
         ends = [line[end] for line in self.passes for end in (0, -1)]
         self._roads = Roads(region, np.array([home, *ends]), self._task.vehicle)
         self._out_s, self._home_s = self._roads.seconds[0, 1::2], self._roads.seconds[2::2, 0]
+        if not np.isfinite([self._out_s, self._home_s]).all():
+            raise ValueError(f"no way leads from home ({home[0]:g}, {home[1]:g}) m to all of the area: move it")
 
     def _parts(self, count: int) -> list[range]:
         return shares(self._pass_s, self._joint_s, self._out_s, self._home_s, count)

@@ -26,7 +26,8 @@ PRINTED: Mapping[str, tuple[float, float, float]] = {
     "spiral 2": (756.0, 7_850.0, 4.2),
 }
 """Table 2: length in m, area in m², time in minutes."""
-CHORD_M = 0.5
+CHORD_M = 1.0
+"""Circles become chords of at most that length."""
 
 
 def radii(outermost_m: float, step_m: float) -> Floats:

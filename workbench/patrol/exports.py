@@ -16,6 +16,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.patrol.flight import stretches
+from pipelines.patrol.footprint import half_tangent
 from pipelines.patrol.place import Origin
 from pipelines.patrol.plan import Flight, Plan
 from workbench.patrol.areas import NO_GO, polygons_of
@@ -26,6 +27,8 @@ WAYPOINT, LAND_AT_START, TAKE_OFF, SPEED, TRIGGER = 16, 20, 22, 178, 206
 """MAV_CMD of MAVLink: NAV_WAYPOINT, NAV_RETURN_TO_LAUNCH, NAV_TAKEOFF, DO_CHANGE_SPEED, DO_SET_CAM_TRIGG_DIST."""
 ABSOLUTE, OVER_HOME, NO_PLACE = 0, 3, 2
 """MAV_FRAME of MAVLink: GLOBAL, GLOBAL_RELATIVE_ALT, MISSION."""
+CAMERA_PX = 512
+"""Rows of a simulated camera's image, which lie across the way."""
 GENERIC, MULTIROTOR, FIXED_WING = 12, 2, 1
 """QGroundControl's firmware (PX4) and vehicle types."""
 
@@ -199,24 +202,41 @@ def _coordinates(parent: ElementTree.Element, points: Floats, sheet: Sheet, heig
     ElementTree.SubElement(parent, "coordinates").text = " ".join(texts)
 
 
-def scenario(sheet_plan: Plan, flight: Flight, *, name: str, height_m: float, origin: Origin | None) -> dict[str, Any]:
+def scenario(
+    plan: Plan,
+    flight: Flight,
+    *,
+    name: str,
+    height_m: float,
+    view_rad: tuple[float, float],
+    origin: Origin | None,
+) -> dict[str, Any]:
     """A scenario of a simulated flight: the world's origin is the first way point, x east and y north.
 
-    It stops and turns at each corner, as `pipelines.patrol.flight.motion` does.
+    It stops and turns at each corner, as `pipelines.patrol.flight.motion` does. The simulated camera's columns lie
+    along the way; without an angle of view along it, its image is square.
     """
+    across, along = view_rad
+    focal = CAMERA_PX / (2 * half_tangent(across))
+    columns = CAMERA_PX if math.isnan(along) else max(round(2 * focal * half_tangent(along)), 1)
     legs: list[dict[str, float]] = []
     for turn, length in stretches(flight.points):
         legs += [{"turn_rad": turn, "turn_s": max(abs(turn), 0.1)}] if abs(turn) > 1e-9 else []
         legs.append({"drive_m": length, "acceleration_mps2": 1.0})
-    speed = sheet_plan.task.vehicle.speed_mps
+    speed = plan.task.vehicle.speed_mps
     values: dict[str, Any] = {
         "name": name,
         "about": f"a planned patrol of {flight.length_m:.0f} m at {speed:g} m/s",
         "trajectory": {"speed_kmh": speed * 3.6, "legs": legs},
-        "camera": {"height_m": height_m, "timing": {"rate_hz": 10.0}},
-        "ground": {"metres_per_px": height_m / 500},
-        "reference": {},
-        "truth": {"rate_hz": 20.0},
+        "camera": {
+            "height_m": height_m,
+            "width_px": columns,
+            "height_px": CAMERA_PX,
+            "focal_px": focal,
+            "timing": {"rate_hz": 4.0},
+        },
+        "ground": {"metres_per_px": height_m / focal},
+        "reference": {"timing": {"rate_hz": 20.0}},
     }
     if origin is not None:
         (latitude, longitude, altitude) = origin.geodetic(flight.points[:1])[0].tolist()

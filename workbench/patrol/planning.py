@@ -125,7 +125,9 @@ def plan(
 def _write(found: Saved, every_m: float, out: Path) -> list[Path]:
     texts = {saved.NAME: saved.to_text(found)}
     for name, flight in exports.flights(found.plan):
-        values = exports.scenario(found.plan, flight, name=name, height_m=found.height_m, origin=found.origin)
+        values = exports.scenario(
+            found.plan, flight, name=name, height_m=found.height_m, view_rad=found.view_rad, origin=found.origin
+        )
         texts[f"{name}.toml"] = _scenario_text(values, name)
     if found.origin is not None:
         sheet = exports.Sheet(found.plan, found.origin, found.height_m, every_m)
@@ -165,15 +167,15 @@ def _map(found: Saved, costs: Account, distance_m: float, out: Path) -> Path:
 def sentences(found: Saved, costs: Account, distance_m: float) -> list[str]:
     """A plan in words."""
     task = found.plan.task
-    strip = task.strip
+    strip, several = task.strip, costs.flights > 1
     finest = "" if math.isnan(distance_m) else f", {100 * distance_m:.2g} cm a pixel"
     lines = [
-        f"{found.height_m:.4g} m high: swath {strip.swath_m:.4g} m{finest}; lanes every {strip.spacing_m:.4g} m or less",
+        f"{found.height_m:.4g} m high: swath {strip.swath_m:.4g} m{finest}; a lane every {strip.spacing_m:.4g} m",
         f"lanes at {math.degrees(found.plan.direction_rad):.1f}° from +x; {costs.passes} passes, {costs.turns} turns",
-        f"{costs.length_m:.1f} m in {costs.flights} flight{'s' if costs.flights > 1 else ''}, "
-        f"{costs.time_s / 60:.2f} min{' (the longest)' if costs.flights > 1 else ''}",
-        f"sweeps {costs.covered_share:.2%} of {costs.target_m2:.0f} m², {costs.covered_reachable_share:.2%} of what can "
-        f"be reached ({costs.reachable_share:.2%}); {costs.useful_m2_per_m:.2f} m² of it a metre",
+        f"{costs.length_m:.1f} m in {costs.flights} flight{'s' * several}, {costs.time_s / 60:.2f} min"
+        + " (the longest)" * several,
+        f"sweeps {costs.covered_share:.2%} of {costs.target_m2:.0f} m², {costs.covered_reachable_share:.2%} of what "
+        f"can be reached ({costs.reachable_share:.2%}); {costs.useful_m2_per_m:.2f} m² a metre",
     ]
     if costs.flights > task.vehicles:
         lines.append(f"{costs.flights} flights: zones or clearance cut the area in parts, one flight each at least")

@@ -79,8 +79,8 @@ def statements(rows: Sequence[Row], variants: Sequence[Row]) -> list[Statement]:
         Statement(
             f"{name}: the area is what is swept",
             _judged(abs(named[name].swept_m2 / named[name].printed[1] - 1) <= BAR),
-            f"printed {named[name].printed[1]:.0f} m², the area of the outermost circle; a strip along the path sweeps "
-            f"{named[name].swept_m2:.0f} m²",
+            f"printed {named[name].printed[1]:.0f} m², the area of the outermost circle; a strip along the path "
+            f"sweeps {named[name].swept_m2:.0f} m²",
         )
         for name in ("spiral 1", "spiral 2")
     ]
@@ -98,7 +98,7 @@ def statements(rows: Sequence[Row], variants: Sequence[Row]) -> list[Statement]:
         Statement(
             "Turns take no time worth counting",
             _judged(longer / snake.printed[2] <= 1 + BAR),
-            f"with {TURN_S:g} s at each of {CORNERS} corners the snake takes {longer:.2f} min, not {snake.printed[2]} min",
+            f"with {TURN_S:g} s at each of {CORNERS} corners the snake takes {longer:.2f} min",
         )
     )
     best = max((snake, named["spiral 1"], named["spiral 2"]), key=lambda row: row.useful_m2_per_m)
