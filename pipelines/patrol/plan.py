@@ -192,9 +192,10 @@ def snake(task: Task) -> Plan:
     if task.vehicle.turn_radius_m > 0:
         lines = [line[k : k + 2] for line in lines for k in range(len(line) - 1)]
     rows = []
-    for region in parts(task.area.allowed):
-        eased = region.buffer(10 * EASE_M)
-        own = [line for line in lines if eased.covers(Point(line[0]))]
+    regions = list(parts(task.area.allowed))
+    owners = [_owner(line, regions) for line in lines]
+    for k, region in enumerate(regions):
+        own = [line for line, owner in zip(lines, owners, strict=True) if owner == k]
         rows += [_Row(task, region, own)] if own else []
     if not rows:
         raise ValueError("nothing of the area is within half a swath of where the vehicle may be: take less clearance")
@@ -202,6 +203,12 @@ def snake(task: Task) -> Plan:
         flight for row, count in zip(rows, _crews(rows, task.vehicles), strict=True) for flight in row.cut(count)
     ]
     return Plan(task, direction, tuple(flights))
+
+
+def _owner(line: Floats, regions: Sequence[Polygon]) -> int:
+    """Which of some regions holds most of a pass."""
+    shared = [LineString(line).intersection(region.buffer(EASE_M)).length for region in regions]
+    return int(np.argmax(shared))
 
 
 def _with_room(task: Task) -> Task:
