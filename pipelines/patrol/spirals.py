@@ -10,7 +10,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
+import shapely
 from numpy.typing import NDArray
+from shapely.geometry.base import BaseGeometry
 
 from pipelines.patrol.area import Area
 from pipelines.patrol.lanes import Strip, lane_offsets, swept
@@ -26,6 +28,8 @@ PRINTED: Mapping[str, tuple[float, float, float]] = {
     "spiral 2": (756.0, 7_850.0, 4.2),
 }
 """Table 2: length in m, area in m², time in minutes."""
+ROUND = 256
+"""Chords of a quarter circle."""
 CHORD_M = 1.0
 """Circles become chords of at most that length."""
 
@@ -53,6 +57,16 @@ def spiral(centre_m: tuple[float, float], outermost_m: float, step_m: float) -> 
         found.append(radius * np.column_stack([np.cos(angle), np.sin(angle)]))
     found.append(np.zeros((1, 2)))
     return np.asarray(np.concatenate(found) + centre_m)
+
+
+def spiral_strip(centre_m: tuple[float, float], outermost_m: float, step_m: float) -> BaseGeometry:
+    """What a bar of a step's width sweeps along `spiral` from its outermost circle on: rings, and the way inwards."""
+    centre, half = shapely.Point(centre_m), step_m / 2
+    shapes = [shapely.box(centre.x, centre.y - half, centre.x + outermost_m, centre.y + half)]
+    for radius in radii(outermost_m, step_m).tolist():
+        inner = centre.buffer(max(radius - half, 0.0), quad_segs=ROUND)
+        shapes.append(centre.buffer(radius + half, quad_segs=ROUND).difference(inner))
+    return shapely.union_all(shapes)
 
 
 def paper_snake(side_m: float = SIDE_M, swath_m: float = SWATH_M) -> Floats:
@@ -98,7 +112,7 @@ def table_2() -> list[Row]:
     lanes = math.ceil(SIDE_M / SWATH_M)
     return [
         _row(
-            "snake", lanes * (SIDE_M + SWATH_M), lanes * SWATH_M * SIDE_M, paper_snake(),
+            "snake", lanes * (SIDE_M + SWATH_M), lanes * SWATH_M * SIDE_M, swept(paper_snake(), SWATH_M),
             f"{lanes} lanes and {lanes} steps of a swath; {lanes} lanes times a swath times the side",
         ),
         _spiral_row("spiral 1", outer, math.pi * half**2 * 2, "half the diagonal with √2 = 1.41"),
@@ -122,18 +136,21 @@ def tight_snake() -> Row:
     way = np.array([(x, y) for k, y in enumerate(offsets.tolist()) for x in ends[k % 2]])
     length = float(np.hypot(*np.diff(way, axis=0).T).sum())
     return _row(
-        "snake, spread evenly", length, math.nan, way, f"{len(offsets)} lanes, {len(offsets) - 1} steps between"
+        "snake, spread evenly",
+        length,
+        math.nan,
+        swept(way, SWATH_M),
+        f"{len(offsets)} lanes, {len(offsets) - 1} steps between",
     )
 
 
 def _spiral_row(name: str, outermost_m: float, circle_m2: float, circle: str) -> Row:
-    way = spiral((SIDE_M / 2, SIDE_M / 2), outermost_m, SWATH_M)
+    strip = spiral_strip((SIDE_M / 2, SIDE_M / 2), outermost_m, SWATH_M)
     text = f"circles from R = {outermost_m:g} m ({circle}), R and a swath of way in; area of the circle"
-    return _row(name, spiral_length(outermost_m, SWATH_M), circle_m2, way[1:], text)
+    return _row(name, spiral_length(outermost_m, SWATH_M), circle_m2, strip, text)
 
 
-def _row(name: str, length_m: float, area_m2: float, way: Floats, reading: str) -> Row:
-    strip = swept(way, SWATH_M)
+def _row(name: str, length_m: float, area_m2: float, strip: BaseGeometry, reading: str) -> Row:
     inside = float(strip.intersection(Area.square(SIDE_M).target).area)
     return Row(
         name=name,

@@ -169,16 +169,16 @@ def _draw() -> Figure:
     from pipelines.patrol.area import parts
     from pipelines.patrol.lanes import swept
 
-    side = spirals.SIDE_M
-    centre = (side / 2, side / 2)
-    paths = {
-        "snake": spirals.paper_snake(),
-        "spiral 1": spirals.spiral(centre, side / 2 * spirals.PRINTED_ROOT, spirals.SWATH_M)[1:],
-        "spiral 2": spirals.spiral(centre, side / 2, spirals.SWATH_M)[1:],
+    side, width = spirals.SIDE_M, spirals.SWATH_M
+    centre, outer = (side / 2, side / 2), side / 2 * spirals.PRINTED_ROOT
+    snake = spirals.paper_snake()
+    paths = {"snake": (snake, swept(snake, width))} | {
+        name: (spirals.spiral(centre, r, width)[1:], spirals.spiral_strip(centre, r, width))
+        for name, r in (("spiral 1", outer), ("spiral 2", side / 2))
     }
     figure, axes = drawing.figure_of(9.0, 3.4, columns=3, sharex=True, sharey=True)
-    for axis, (name, path) in zip(axes[0], paths.items(), strict=True):
-        for part in parts(swept(path, spirals.SWATH_M)):
+    for axis, (name, (path, strip)) in zip(axes[0], paths.items(), strict=True):
+        for part in parts(strip):
             axis.fill(*part.exterior.xy, color=drawing.BLUE, alpha=0.25, label="swept")
             for ring in part.interiors:
                 axis.fill(*ring.xy, color="white")
