@@ -337,13 +337,6 @@ def _map(
     contents: str | Sequence[str] = "/world/**",
 ) -> rrb.Spatial3DView:
     """The ground from above, x to the right, y up; the trails of a run up to the cursor, where one is named."""
-    eye = None
-    if extent is not None:
-        eye = rrb.EyeControls3D(
-            position=(extent.x_m, extent.y_m, extent.eye_m),
-            look_target=(extent.x_m, extent.y_m, 0.0),
-            eye_up=(0.0, 1.0, 0.0),
-        )
     trail = rrb.VisibleTimeRanges(
         [
             rr.VisibleTimeRange(name, start=rr.TimeRangeBoundary.infinite(), end=rr.TimeRangeBoundary.cursor_relative())
@@ -351,12 +344,26 @@ def _map(
         ]
     )
     overrides: dict[Any, Any] = {f"/world/runs/{run}/{trailed}": trail for trailed in trails if run}
+    return ground_view(contents, extent, name, overrides)
+
+
+def ground_view(
+    contents: str | Sequence[str], extent: Extent | None, name: str, overrides: Mapping[Any, Any] | None = None
+) -> rrb.Spatial3DView:
+    """What is in the world, seen from above: x to the right, y up."""
+    eye = None
+    if extent is not None:
+        eye = rrb.EyeControls3D(
+            position=(extent.x_m, extent.y_m, extent.eye_m),
+            look_target=(extent.x_m, extent.y_m, 0.0),
+            eye_up=(0.0, 1.0, 0.0),
+        )
     return rrb.Spatial3DView(
         origin="/world",
         contents=contents if isinstance(contents, str) else list(contents),
         name=name,
         eye_controls=eye,
-        overrides=overrides,
+        overrides=dict(overrides or {}),
         background=[18, 20, 24],
     )
 

@@ -1,0 +1,1 @@
+"""Patrol on files: areas in, plans out, a flight held against its plan."""
