@@ -515,6 +515,8 @@ def _gyro_bias(case: Case, bounds: Bounds) -> Claims:
                 worst, most = (found[a].first + found[a + 2].last) // 2, abs(mean) / sigma
     if not rates:
         return
+    if rows[found[-1].last]:  # what is left is too short for a pair of its own
+        rows[found[-1].last :] = True
     bias = -float(np.median(rates))
     rest = _rest_rate(case)
     nis = looks.median_nis(case)
@@ -767,7 +769,7 @@ CAUSES: Mapping[str, tuple[str, ...]] = {
     "wrong-mounting": (*_STAMPS, "input-noise-too-small", "gyro-bias"),
     "track-slip": _COMMON,
     "track-outliers": (*_COMMON, "track-slip"),
-    "near-focus": ("pure-rotation",),
+    "near-focus": ("pure-rotation", "late-images"),
     "standstill": ("pure-rotation",),
     "odometer-scale": _COMMON,
 }
