@@ -106,15 +106,15 @@ def _open_log(path: Path, scratch: list[TemporaryDirectory[str]]) -> MessageLog 
 
         return McapLog(path)
     if start.startswith(ROS1):
-        from readers.rosbag import Ros1Log
+        from readers.ros1_bag import Ros1Log
 
         return Ros1Log(path)
     if start.startswith(SQLITE):
-        from readers.rosbag import SqliteLog
+        from readers.ros2_db3 import SqliteLog
 
         return SqliteLog(path)
     if start.startswith(ZSTD):
-        from readers.rosbag import unpack
+        from readers.bag_folder import unpack
 
         try:
             return _open_log(unpack(path, scratch), scratch)
@@ -157,7 +157,7 @@ def _is_bag_folder(path: Path) -> bool:
 
 
 def _open_bag_folder(path: Path, options: ReadOptions) -> Recording:
-    from readers.rosbag import read_metadata
+    from readers.bag_folder import read_metadata
 
     files = _storage_files(path)
     metadata = read_metadata(path)
@@ -178,7 +178,7 @@ def _open_parts(
     path: Path, files: Sequence[Path], options: ReadOptions, form: str, notes: Sequence[str] = ()
 ) -> Recording:
     """Take files without a list of them for one log, if their names differ in numbers only."""
-    from readers.rosbag import natural_key
+    from readers.bag_folder import natural_key
 
     files = sorted(files, key=lambda file: natural_key(file.name))
     shapes = {"".join(part for number, part in natural_key(file.name) if number < 0) for file in files}
