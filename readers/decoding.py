@@ -25,9 +25,10 @@ from google.protobuf.message import DecodeError  # type: ignore[import-untyped, 
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
-from readers.message_log import LARGEST_BLOCK_BYTES, Buffer, Channel, text
+from readers.message_log import Buffer, Channel, text
 
 Decoder = Callable[[Buffer], Any]
+LARGEST_MESSAGE_BYTES = 2**28
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
 _WELL_KNOWN = {module.DESCRIPTOR.name: module.DESCRIPTOR for module in (duration_pb2, timestamp_pb2)}
 _IDL_RULE = "=" * 80 + "\n"
@@ -68,6 +69,36 @@ def ros_name(name: str) -> str:
     return name if "/" in rest or not rest else f"{package}/msg/{rest}"
 
 
+def unpacked(encoding: str, data: Buffer) -> Buffer:
+    """The message itself, where it is one of a ROS 2 bag that was packed with zstd on its own.
+
+    Raises:
+        MessageError: it cannot be unpacked.
+    """
+    if encoding != "cdr" or data[:4] != ZSTD_MAGIC:
+        return data
+    try:
+        found = zstandard.ZstdDecompressor().stream_reader(data).read(LARGEST_MESSAGE_BYTES + 1)
+    except zstandard.ZstdError as error:
+        raise MessageError(f"the message cannot be unpacked ({error})") from error
+    if len(found) > LARGEST_MESSAGE_BYTES:
+        raise MessageError(f"the message is larger than {LARGEST_MESSAGE_BYTES} bytes when unpacked")
+    return found
+
+
+def definition_of(channel: Channel) -> tuple[str, bytes]:
+    """Encoding and text of the definition of a channel's type: the log's, else the distribution's, else empty."""
+    name = ros_name(channel.type)
+    if channel.schema.strip() or channel.encoding not in ("ros1", "cdr"):
+        return channel.schema_encoding, channel.schema
+    generation = 1 if channel.encoding == "ros1" else 2
+    store = _types_of_distribution(channel.encoding)
+    form = f"ros{generation}msg"
+    if name not in store.fielddefs:
+        return form, b""
+    return form, store.generate_msgdef(name, ros_version=generation)[0].encode()
+
+
 @lru_cache(maxsize=256)
 def _ros_decoder(encoding: str, type_name: str, schema_encoding: str, schema: bytes) -> Decoder:
     name = ros_name(type_name)
@@ -78,11 +109,7 @@ def _ros_decoder(encoding: str, type_name: str, schema_encoding: str, schema: by
 
     def decode(data: Buffer) -> Any:
         try:
-            if encoding == "cdr" and data[:4] == ZSTD_MAGIC:
-                data = zstandard.ZstdDecompressor().stream_reader(data).read(LARGEST_BLOCK_BYTES)
-            return deserialize(data, name)
-        except zstandard.ZstdError as error:
-            raise MessageError(f"the message cannot be unpacked ({error})") from error
+            return deserialize(unpacked(encoding, data), name)
         except (SerdeError, TypesysError, KeyError, AssertionError, OverflowError, MemoryError) as error:
             raise MessageError(f"the message does not fit {type_name} ({error})") from error
 

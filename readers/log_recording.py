@@ -31,6 +31,7 @@ from readers.messages import (
     samples_of,
     stamp_ns,
 )
+from readers.salvage import Loss
 from readers.streams import (
     Camera,
     CameraInfo,
@@ -268,6 +269,20 @@ class LogRecording(Recording):
             for log in self._logs
             for harm in log.damage
         )
+
+    @property
+    def losses(self) -> tuple[Loss, ...]:
+        """What of the files could not be read, as far as they were read by now, in the form that can be counted."""
+        return tuple(loss for log in self._logs for loss in log.losses)
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """The channels of all files."""
+        return tuple(channel for log in self._logs for channel in log.channels)
+
+    def messages(self) -> Iterator[Message]:
+        """All messages that can be read, as they are stored, in the order of their log times."""
+        return self._messages(self.channels)
 
     # ------------------------------------------------------------------------------ cameras
 

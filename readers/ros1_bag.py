@@ -440,7 +440,7 @@ class Ros1Log(MessageLog):
 
     def _is_record(self, offset: int) -> bool:
         try:
-            return record_at(self._data, offset).operation in (_CHUNK, *_BETWEEN_CHUNKS)
+            return record_at(self._data, offset).operation in (_CHUNK, _CONNECTION, _CHUNK_INFO)
         except TornError:
             return False
 
@@ -554,7 +554,8 @@ class Ros1Log(MessageLog):
         self._aheads.add(ahead)
         low, high = start_ns or 0, stop_ns if stop_ns is not None else _END_OF_TIME
         for chunk in chosen:
-            yield Source(chunk.first_ns, partial(self._select, chunk, wanted, low, high, ahead))
+            select = partial(self._select, chunk, wanted, low, high, ahead)
+            yield Source(chunk.first_ns, select, max(span.last_ns for span in chunk.spans.values()))
 
     def _select(
         self, chunk: Chunk, wanted: Collection[Channel], low: int, high: int, ahead: Ahead[Chunk, Buffer]

@@ -37,6 +37,7 @@ from workbench.terminal import (
 
 if TYPE_CHECKING:
     from pipelines.simulation.mission import SimulatedMission
+    from readers.salvage import Loss, Tally
     from readers.streams import Camera, ReadOptions, Recording, StreamInfo
     from workbench.reproduce import report as reports_a
     from workbench.reproduce.judged import Statement
@@ -222,6 +223,84 @@ def _camera_text(camera: Camera) -> str:
         return f"{size}, not calibrated"
     (fx, _, cx), (_, fy, cy), _ = camera.matrix.tolist()
     return f"{size}, f {fx:.6g} {fy:.6g}, centre {cx:.6g} {cy:.6g}, distortion {shown(camera.distortion_model)}"
+
+
+# -------------------------------------------------------------------------------- recover
+
+
+@app.command(
+    short_help="Write what can be read of a damaged log as a clean MCAP file.",
+    epilog=examples(
+        "workbench recover mission.bag -o mission.mcap",
+        "workbench recover rosbag2_folder/ -o mission.mcap --json",
+    ),
+)
+def recover(
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", help="ROS 1 bag, ROS 2 bag or MCAP, or a folder of its parts.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="OUT.mcap", help="File to write; it must not exist.")],
+    as_json: AsJson = False,
+) -> None:
+    """Write the readable messages of a log, as they are stored, into an MCAP file with an index; tell what was lost.
+
+    Definitions, encodings and times are kept: messages of ROS 1 stay messages of ROS 1. Ctrl-C ends the file early and
+    leaves it readable. Exit status: 0 nothing was damaged, 3 something was lost, 2 nothing can be read.
+    """
+    from workbench.recovery import recover as write
+    from workbench.session import Progress, open_any
+
+    with open_any(path, _options(None, None, "auto", None)) as recording, Bar(out.name, "message") as bar:
+        try:
+            done = write(recording, out, on_progress=lambda done, total: bar(Progress(done, total, 0)))
+        except KeyboardInterrupt:
+            print(f"interrupted: {out} holds what was written so far", file=sys.stderr)
+            raise
+    losses = _loss_values(done.topics, done.losses)
+    skipped = [{"topic": topic, "count": n, "reason": why} for (topic, why), n in done.skipped.items()]
+    if as_json:
+        print_json({"path": str(out), **losses, "damage": list(done.damage), "not_written": skipped})
+    else:
+        print(f"{out}: {sum(tally.recovered for tally in done.topics.values())} messages of {shown(str(path))}")
+        _print_losses(losses)
+        print_list("not written", [f"{one['topic']}: {one['count']} messages: {one['reason']}" for one in skipped])
+        print_list("damage", done.damage)
+    if not done.clean:
+        raise typer.Exit(IN_PART)
+
+
+def _loss_values(topics: Mapping[str, Tally], losses: Iterable[Loss]) -> dict[str, Any]:
+    """The report of loss as plain values: by topic the counts and the last good time, and each piece of damage."""
+    return {
+        "topics": [
+            {
+                "name": name,
+                "recovered": tally.recovered,
+                "lost": tally.lost,
+                "withheld": tally.withheld,
+                "undecodable": tally.undecodable,
+            }
+            for name, tally in sorted(topics.items())
+        ],
+        "losses": [
+            {
+                "what": str(loss.what),
+                "text": loss.text,
+                "bytes": None if loss.start < 0 else [loss.start, loss.stop],
+                "first_ns": None if loss.first_ns < 0 else loss.first_ns,
+                "last_ns": None if loss.last_ns < 0 else loss.last_ns,
+            }
+            for loss in losses
+        ],
+    }
+
+
+def _print_losses(values: Mapping[str, Any]) -> None:
+    """Print by topic what was read and what is known to be lost."""
+    heads = ("topic", "recovered", "lost", "withheld", "undecodable")
+    rows = [tuple(str(topic[key]) for key in ("name", *heads[1:])) for topic in values["topics"]]
+    if rows:
+        print("\n" + "\n".join(table(heads, rows, right=(1, 2, 3, 4))))
 
 
 # --------------------------------------------------------------------------------- replay
