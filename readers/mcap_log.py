@@ -1,60 +1,79 @@
 """MCAP files of every profile: with or without index, chunked or not, whole or torn.
 
-The layout is that of the MCAP specification, https://mcap.dev/spec. The summary is parsed by the `mcap`
-library's record classes. Chunks are unpacked here, one at a time, because a damaged one must not
-stop the others and every checksum is to be validated, which the library's reader does not offer.
+With a sound summary the file is opened by its index alone. Without one `readers.mcap_scan` walks over its records.
+Chunks are unpacked one at a time, ahead of the reading, and always compared with their checksums.
 """
 
 from __future__ import annotations
 
-import struct
-import zlib
-from collections.abc import Iterator
-from io import BytesIO
+import mmap
+from collections import Counter, OrderedDict
+from collections.abc import Collection, Iterable, Iterator, Mapping
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
 from pathlib import Path
-from typing import Any
+from types import MappingProxyType
 
-from mcap import records
-from mcap.data_stream import ReadDataStream
-from mcap.exceptions import McapError
-from mcap.opcode import Opcode
+import numpy as np
 
-from readers.message_log import Block, BlockLog, Channel, DamagedBlockError, Message, inflate, text
+from readers.mcap_records import (
+    FOOTER,
+    HEAD,
+    INDEX_ENTRY,
+    INDEX_HEAD,
+    MAGIC,
+    ChannelRecord,
+    ChunkIndex,
+    Opcode,
+    RecordError,
+    Segment,
+    Stated,
+    Statistics,
+    Unpacked,
+    Walked,
+    read_channel,
+    read_chunk_index,
+    read_message_index,
+    read_profile,
+    read_schema,
+    read_statistics,
+    unpack_chunk,
+    walk,
+)
+from readers.message_log import Block, Channel, IndexedLog, Message, Source, crc32
+from readers.salvage import Cause, Loss, Tally
 from readers.streams import RecordingError
 
-MAGIC = b"\x89MCAP0\r\n"
-RUN_BYTES = 1 << 20
-_HEAD = struct.Struct("<BQ")
-_MESSAGE = struct.Struct("<HIQQ")
-_CHUNK = struct.Struct("<QQQII")
-_INDEX_HEAD = struct.Struct("<BQHI")
-_INDEX_ENTRY_BYTES = 16
-_FOOTER = struct.Struct("<BQQQI8s")
+READ_AHEAD = 2
+KEPT_BLOCKS = 4
+KEPT_BYTES = 1 << 24
+WORTH_A_THREAD_BYTES = 1 << 16
 _DEFAULT_ENCODING = {"ros1": "ros1", "ros2": "cdr"}
-_PARSE_ERRORS = (McapError, struct.error, ValueError, KeyError, OverflowError, MemoryError)
 
 
-def _record(kind: Any, body: bytes | memoryview) -> Any:
-    return kind.read(ReadDataStream(BytesIO(body)))
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class McapBlock(Block):
+    """A chunk, or a run of messages outside of chunks.
+
+    `stated` is what the chunk index says of it, `indexes` the offsets of its message indexes by channel.
+    """
+
+    segment: Segment
+    chunk: bool = True
+    stated: Stated | None = None
+    indexes: Mapping[Channel, int] = field(default_factory=dict)
+
+    def of(self, first_ns: int, last_ns: int, counts: Mapping[Channel, int]) -> McapBlock:
+        """The same block, whose content is known."""
+        return replace(self, first_ns=first_ns, last_ns=last_ns, counts=counts)
+
+    @property
+    def memory_bytes(self) -> int:
+        """How much memory it takes to unpack it; none where it lies in the file as it is."""
+        return self.stated.unpacked_bytes if self.stated is not None and self.stated.compression else 0
 
 
-def _split(data: memoryview) -> Iterator[tuple[int, memoryview | None]]:
-    """Opcode and body of each record in `data`; a record that does not fit comes last, with None."""
-    at = 0
-    while at < len(data):
-        if at + _HEAD.size > len(data):
-            yield 0, None
-            return
-        opcode, length = _HEAD.unpack_from(data, at)
-        at += _HEAD.size
-        if opcode == 0 or at + length > len(data):
-            yield opcode, None
-            return
-        yield opcode, data[at : at + length]
-        at += length
-
-
-class McapLog(BlockLog):
+class McapLog(IndexedLog):
     """One MCAP file.
 
     Raises:
@@ -63,218 +82,339 @@ class McapLog(BlockLog):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "MCAP")
-        self._schemas: dict[int, Any] = {}
-        self._by_id: dict[int, Channel] = {}
-        self._profile = ""
+        with path.open("rb") as file:
+            self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
+        self.view = memoryview(self._map)
+        self.statistics: Statistics | None = None
+        self._unpacked: OrderedDict[int, Future[Unpacked]] = OrderedDict()
+        self._checked: set[int] = set()
+        self._thread: ThreadPoolExecutor | None = None
         try:
-            self._read_header()
-            fault = self._read_summary()
-            if fault is not None:
-                self._forget()
-                self._scan(fault)
-            else:
-                self._find_edges()
+            self._open()
         except BaseException:
             self.close()
             raise
-        if self._profile:
-            self.format = f"MCAP, profile {self._profile}"
 
-    def _read_header(self) -> None:
-        start = self._bytes(0, 1 << 16)
-        if not start.startswith(MAGIC):
+    def _open(self) -> None:
+        from readers.mcap_scan import Scan
+
+        if self.view[: len(MAGIC)] != MAGIC:
             raise RecordingError(self.path, "it does not begin like an MCAP file", "check that the file is complete")
-        for opcode, body in _split(memoryview(start)[len(MAGIC) :]):
-            if opcode == Opcode.HEADER and body is not None:
-                length = struct.unpack_from("<I", body)[0]
-                self._profile = text(body[4 : 4 + length])
-            return
+        segment = Segment(profile=self.profile(0))
+        fault = self._read_summary(segment)
+        if fault is None:
+            self._find_edges()
+        else:
+            self._blocks.clear()
+            Scan(self, segment, fault).run()
+        if segment.profile:
+            self.format = f"MCAP, profile {segment.profile}"
 
-    def _forget(self) -> None:
-        self._schemas, self._by_id, self.channels, self._blocks = {}, {}, [], []
+    def profile(self, start: int) -> str:
+        """The profile of the file that begins at `start`, "" if its header is damaged."""
+        opcode, body = self.record(start + len(MAGIC))
+        try:
+            return read_profile(body) if opcode == Opcode.HEADER else ""
+        except RecordError:
+            return ""
 
-    # ------------------------------------------------------------------------- with index
+    def find(self, what: bytes, start: int) -> int:
+        """Where `what` occurs next in the file, -1 if nowhere."""
+        return self._map.find(what, start)
 
-    def _read_summary(self) -> str | None:
+    def record(self, at: int) -> tuple[int, memoryview]:
+        """Opcode and body of the record at `at`, as far as the file goes; opcode 0 if there is none."""
+        if at + HEAD.size > len(self.view):
+            return 0, self.view[:0]
+        opcode, length = HEAD.unpack_from(self.view, at)
+        return opcode, self.view[at + HEAD.size : at + HEAD.size + length]
+
+    # ---------------------------------------------------------------------------- summary
+
+    def _read_summary(self, segment: Segment) -> str | None:
         """Take channels, counts and blocks from the summary.
 
         Returns:
             None when that is done, else why the file must be scanned: "" if it simply has no full
             index, or a clause that says what is damaged.
         """
-        tail = self._bytes(max(0, self._size - _FOOTER.size), _FOOTER.size)
-        if len(tail) < _FOOTER.size or tail[-8:] != MAGIC:
+        view, size = self.view, len(self.view)
+        if size < FOOTER.size + len(MAGIC) or view[-len(MAGIC) :] != MAGIC:
             return "the file was not closed (it has no footer)"
-        opcode, length, start, _, crc, _ = _FOOTER.unpack(tail)
-        if opcode != Opcode.FOOTER or length != 20:
+        opcode, length, start, _, crc, _ = FOOTER.unpack_from(view, size - FOOTER.size)
+        if opcode != Opcode.FOOTER or length != FOOTER.size - HEAD.size - len(MAGIC):
             return "the footer is damaged"
         if start == 0:
             return ""
-        if not len(MAGIC) < start < self._size - _FOOTER.size:
+        end = size - FOOTER.size
+        if not len(MAGIC) < start < end:
             return "the footer points to no place of the file"
-        section = self._bytes(start, self._size - start - len(MAGIC))
-        if crc and zlib.crc32(section[:-4]) != crc:
+        if crc and crc32(view[start : size - len(MAGIC) - 4]) != crc:
             return "the index does not match its checksum"
+        trial = Segment(profile=segment.profile)
         try:
-            return None if self._take_summary(memoryview(section)) else ""
-        except _PARSE_ERRORS:
+            complete = self._take_summary(trial, start, end)
+        except (RecordError, OverflowError):
+            self.channels.clear()
             return "the index cannot be parsed"
+        segment.schemas, segment.records, segment.channels = trial.schemas, trial.records, trial.channels
+        return None if complete else ""
 
-    def _take_summary(self, section: memoryview) -> bool:
+    def _take_summary(self, segment: Segment, start: int, end: int) -> bool:
         """Read the records of the summary; False where they do not describe the whole file."""
-        statistics: Any = None
-        indexes: list[Any] = []
-        for opcode, body in _split(section):
-            if body is None:
-                raise ValueError
+        indexes: list[ChunkIndex] = []
+        at = start
+        while at < end:
+            opcode, body = self.record(at)
+            at += HEAD.size + len(body)
+            if at > end or opcode in (0, Opcode.HEADER, Opcode.FOOTER, Opcode.MESSAGE, Opcode.CHUNK, Opcode.DATA_END):
+                raise RecordError
             if opcode == Opcode.STATISTICS:
-                statistics = _record(records.Statistics, body)
+                self.statistics = read_statistics(body)
             elif opcode == Opcode.CHUNK_INDEX:
-                indexes.append(_record(records.ChunkIndex, body))
+                indexes.append(read_chunk_index(body))
             else:
-                self._describe(opcode, body)
-        if statistics is None or (statistics.message_count and not indexes):
+                self.describe(segment, opcode, body)
+        if self.statistics is None or any(not index.indexes for index in indexes):
             return False
-        for index in indexes:
-            if not index.message_index_offsets or not set(index.message_index_offsets) <= set(self._by_id):
-                return False
-            counts = {
-                self._by_id[number]: self._indexed_count(offset, number)
-                for number, offset in index.message_index_offsets.items()
-            }
-            self._blocks.append(
-                Block(
-                    index.chunk_start_offset,
-                    index.chunk_length,
-                    index.message_start_time,
-                    index.message_end_time,
-                    counts,
-                )
-            )
-        if not set(statistics.channel_message_counts) <= set(self._by_id):
+        if not all(set(index.indexes) <= set(segment.channels) for index in indexes):
             return False
-        for number, count in statistics.channel_message_counts.items():
-            self._by_id[number].count = count
+        self._blocks = [self._block(segment, index, start) for index in indexes]
+        return self._agrees(segment, self.statistics)
+
+    def _block(self, segment: Segment, index: ChunkIndex, limit: int) -> McapBlock:
+        if index.offset + index.length > limit or index.length < HEAD.size or index.first_ns > index.last_ns:
+            raise RecordError
+        indexes = {segment.channels[number]: at for number, at in index.indexes.items()}
+        counts = {segment.channels[number]: self._indexed_count(number, at) for number, at in index.indexes.items()}
+        return McapBlock(
+            index.offset,
+            index.length,
+            index.first_ns,
+            index.last_ns,
+            counts,
+            segment=segment,
+            stated=Stated(index.compression, index.packed_bytes, index.unpacked_bytes),
+            indexes=indexes,
+        )
+
+    def _indexed_count(self, number: int, at: int) -> int:
+        """How many messages the message index at `at` lists.
+
+        Raises:
+            RecordError: there is no index of the channel of that number.
+        """
+        if at + INDEX_HEAD.size > len(self.view):
+            raise RecordError
+        opcode, length, found, size = INDEX_HEAD.unpack_from(self.view, at)
+        if opcode != Opcode.MESSAGE_INDEX or found != number or size % INDEX_ENTRY.itemsize or size + 6 > length:
+            raise RecordError
+        return int(size) // INDEX_ENTRY.itemsize
+
+    def _agrees(self, segment: Segment, statistics: Statistics) -> bool:
+        """Whether the indexes and the statistics count the same messages; keeps the counts."""
+        total: Counter[Channel] = Counter()
+        for block in self._blocks:
+            total.update(block.counts)
+        stated = {segment.channels.get(number): count for number, count in statistics.counts.items() if count}
+        if dict(+total) != stated or sum(total.values()) != statistics.messages:
+            return False
+        for channel, count in total.items():
+            channel.count = count
         return True
 
-    def _indexed_count(self, offset: int, number: int) -> int:
-        """How many messages of a channel the message index at `offset` lists."""
-        opcode, _, channel, size = _INDEX_HEAD.unpack(self._bytes(offset, _INDEX_HEAD.size))
-        if opcode != Opcode.MESSAGE_INDEX or channel != number:
-            raise ValueError
-        return int(size) // _INDEX_ENTRY_BYTES
+    def describe(self, segment: Segment, opcode: int, body: memoryview) -> bool:
+        """Take a schema or a channel; other records are passed over. False where it contradicts an earlier one.
 
-    def _describe(self, opcode: int, body: memoryview) -> None:
-        """Take a schema or a channel; other records are passed over."""
+        Raises:
+            RecordError: it cannot be parsed.
+        """
         if opcode == Opcode.SCHEMA:
-            schema = _record(records.Schema, body)
-            self._schemas[schema.id] = schema
-        elif opcode == Opcode.CHANNEL:
-            channel = _record(records.Channel, body)
-            if channel.id in self._by_id:
-                return
-            schema = self._schemas.get(channel.schema_id)
-            taken = Channel(
-                topic=channel.topic,
-                type=schema.name if schema else "",
-                encoding=channel.message_encoding or _DEFAULT_ENCODING.get(self._profile, ""),
-                schema_encoding=schema.encoding if schema else "",
-                schema=schema.data if schema else b"",
-            )
-            self._by_id[channel.id] = taken
-            self.channels.append(taken)
+            number, schema = read_schema(body)
+            return segment.schemas.setdefault(number, schema) == schema
+        if opcode == Opcode.CHANNEL:
+            number, record = read_channel(body)
+            if number in segment.channels:
+                return segment.records[number] == record
+            self._add_channel(segment, number, record)
+        return True
 
-    # ---------------------------------------------------------------------- without index
+    def _add_channel(self, segment: Segment, number: int, record: ChannelRecord) -> None:
+        schema = segment.schemas.get(record.schema)
+        channel = Channel(
+            topic=record.topic,
+            type=schema.name if schema else "",
+            encoding=record.encoding or _DEFAULT_ENCODING.get(segment.profile, ""),
+            schema_encoding=schema.encoding if schema else "",
+            schema=schema.data if schema else b"",
+        )
+        segment.channels[number], segment.records[number] = channel, record
+        self.channels.append(channel)
 
-    def _scan(self, fault: str) -> None:
-        """Walk over the records from the start, up to the end of the data or to the tear."""
-        self.notes.append("The file has no usable index; it was read once to list what it holds.")
-        offset, run_start = len(MAGIC), -1
-        closed, problem = False, ""
-        while offset < self._size:
-            head = self._bytes(offset, _HEAD.size)
-            opcode, length = _HEAD.unpack(head) if len(head) == _HEAD.size else (0, 0)
-            end = offset + _HEAD.size + length
-            run_ends = opcode != Opcode.MESSAGE or end > self._size or end - run_start > RUN_BYTES
-            if run_start >= 0 and run_ends:
-                self._take(run_start, offset - run_start)
-                run_start = -1
-            if opcode in (Opcode.DATA_END, Opcode.FOOTER):
-                closed = True
-                break
-            if opcode == 0 or end > self._size:
-                problem = self._torn(offset, opcode)
-                break
-            if opcode == Opcode.CHUNK:
-                self._take(offset, end - offset)
-            elif opcode == Opcode.MESSAGE:
-                run_start = offset if run_start < 0 else run_start
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                self._describe_or_report(offset, opcode, self._bytes(offset + _HEAD.size, length))
-            offset = end
-        else:
-            if run_start >= 0:
-                self._take(run_start, offset - run_start)
-        self._report_end(offset, closed, fault, problem)
+    def _find_edges(self) -> None:
+        """Fill in the first and last log time of every channel, from the message indexes that can hold them."""
+        blocks = [block for block in self._blocks if isinstance(block, McapBlock)]
+        for block in sorted(blocks, key=lambda b: b.first_ns):
+            for channel in block.counts:
+                if channel.first_ns < 0 or block.first_ns < channel.first_ns:
+                    found = self._indexed_times(block, channel)[0]
+                    channel.first_ns = found if channel.first_ns < 0 else min(found, channel.first_ns)
+        for block in sorted(blocks, key=lambda b: -b.last_ns):
+            for channel in block.counts:
+                if block.last_ns > channel.last_ns:
+                    channel.last_ns = max(self._indexed_times(block, channel)[1], channel.last_ns)
 
-    def _torn(self, offset: int, opcode: int) -> str:
-        """Read what there is of the record that is cut at `offset`; a clause that says so."""
-        if opcode != Opcode.CHUNK:
-            return "the file ends inside a record" if opcode else "no record begins where one should"
-        found = self._take(offset, self._size - offset, torn=True)
-        return f"the file ends inside a chunk, {found} messages of which are read without a checksum; the chunk begins"
-
-    def _report_end(self, offset: int, closed: bool, fault: str, problem: str) -> None:
-        if problem:
-            self._report(problem, offset, self._size - offset)
-        elif closed and fault:
-            self._report(f"{fault}, though every message can be read; the damage begins", offset, 0)
-        elif not closed:
-            self._report("the file was not closed, what is there can be read; it breaks off", offset, 0)
-
-    def _describe_or_report(self, offset: int, opcode: int, body: bytes) -> None:
+    def _indexed_times(self, block: McapBlock, channel: Channel) -> tuple[int, int]:
+        """First and last log time of a channel in a block; those of the block where its index is damaged."""
         try:
-            self._describe(opcode, memoryview(body))
-        except _PARSE_ERRORS:
-            self._report("a schema or channel record cannot be parsed", offset, len(body))
+            times = read_message_index(self.record(block.indexes[channel])[1])[1]["log_ns"]
+        except RecordError:
+            times = np.empty(0, np.uint64)
+        inside = times[(times >= block.first_ns) & (times <= block.last_ns)]
+        return (int(inside.min()), int(inside.max())) if len(inside) else (block.first_ns, block.last_ns)
+
+    # ------------------------------------------------------------------------------ losses
+
+    def report(
+        self,
+        what: Cause,
+        text: str,
+        start: int,
+        stop: int,
+        topics: dict[str, Tally] | None = None,
+        times_ns: tuple[int, int] = (-1, -1),
+    ) -> None:
+        """Note what was lost between two bytes of the file."""
+        self.lose(
+            Loss(
+                what=what,
+                text=text,
+                start=start,
+                stop=stop,
+                file_bytes=len(self.view),
+                first_ns=times_ns[0],
+                last_ns=times_ns[1],
+                topics=MappingProxyType(topics or {}),
+            )
+        )
+
+    def _report_block(self, block: McapBlock, unpacked: Unpacked) -> None:
+        for what, fault in unpacked.faults:
+            counts = {channel.topic: Tally(withheld=count) for channel, count in block.counts.items()}
+            span = (block.offset, block.offset + block.size if unpacked.withheld else block.offset)
+            times = (block.first_ns, block.last_ns)
+            self.report(what, fault, *span, counts if unpacked.withheld else None, times)
 
     # ------------------------------------------------------------------------------ blocks
 
-    def _unpack(self, raw: memoryview, torn: bool) -> tuple[list[Message], str]:
-        if not raw or raw[0] != Opcode.CHUNK:
-            return self._messages(raw, torn)
-        body = raw[_HEAD.size :]
-        try:
-            _, _, size, crc, name_length = _CHUNK.unpack_from(body)
-            compression = text(body[_CHUNK.size : _CHUNK.size + name_length])
-            (length,) = struct.unpack_from("<Q", body, _CHUNK.size + name_length)
-        except struct.error as error:
-            raise DamagedBlockError("a chunk ends within its header") from error
-        packed = body[_CHUNK.size + name_length + 8 :][:length]
-        if len(packed) < length and not torn:
-            raise DamagedBlockError(f"a chunk states {length} bytes and {len(packed)} are there")
-        data = memoryview(inflate(compression, packed, size, torn=torn))
-        if crc and not torn and zlib.crc32(data) != crc:
-            raise DamagedBlockError("a chunk does not match its checksum and is left out")
-        return self._messages(data, torn)
+    def unpack(self, block: McapBlock) -> Unpacked:
+        """The records of a block, compared with their checksum once."""
+        body = self.view[block.offset : block.offset + block.size]
+        if not block.chunk:
+            return Unpacked(body)
+        unchecked = block.offset not in self._checked
+        found = unpack_chunk(body[HEAD.size :], block.stated, torn=block.torn, check=unchecked)
+        if not found.withheld:
+            self._checked.add(block.offset)
+        return found
 
-    def _messages(self, data: memoryview, torn: bool) -> tuple[list[Message], str]:
-        found: list[Message] = []
-        strangers = 0
-        for opcode, body in _split(data):
-            if body is None:
-                return found, "" if torn else "the records of a chunk break off"
-            if opcode == Opcode.MESSAGE:
-                if len(body) < _MESSAGE.size:
-                    return found, "a message record is too short"
-                number, _, log_ns, _ = _MESSAGE.unpack_from(body)
-                if (channel := self._by_id.get(number)) is not None:
-                    found.append(Message(log_ns, channel, body[_MESSAGE.size :]))
-                else:
-                    strangers += 1
-            elif opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
-                try:
-                    self._describe(opcode, body)
-                except _PARSE_ERRORS:
-                    return found, "a schema or channel record cannot be parsed"
-        return found, f"{strangers} messages are of channels that the file does not describe" if strangers else ""
+    def _load(self, block: McapBlock, ahead: Collection[McapBlock] = ()) -> Unpacked:
+        """The records of a block; the blocks that will be asked for next are unpacked in a thread meanwhile."""
+        future = self._unpacked.get(block.offset)
+        if future is None:
+            future = Future()
+            future.set_result(self.unpack(block))
+            self._unpacked[block.offset] = future
+        for following in ahead if block.memory_bytes * KEPT_BLOCKS <= KEPT_BYTES else ():
+            if following.offset not in self._unpacked and following.size >= WORTH_A_THREAD_BYTES:
+                self._thread = self._thread or ThreadPoolExecutor(1, "unpack")
+                self._unpacked[following.offset] = self._thread.submit(self.unpack, following)
+        self._unpacked.move_to_end(block.offset)
+        unpacked = future.result()
+        kept = KEPT_BLOCKS if block.memory_bytes * KEPT_BLOCKS <= KEPT_BYTES else 1
+        while len(self._unpacked) > kept:
+            self._unpacked.popitem(last=False)
+        if unpacked.faults:
+            self._report_block(block, unpacked)
+        return unpacked
+
+    def messages_of(self, block: McapBlock, channels: Collection[Channel] | None = None) -> Walked:
+        """The messages of the channels (all if None) in one block, in the order of the file."""
+        numbered = block.segment.channels
+        wanted = {n: c for n, c in numbered.items() if c in channels} if channels is not None else numbered
+        return walk(self._load(block).records, block.segment, wanted)
+
+    def _select(
+        self, block: Block, channels: Collection[Channel], start_ns: int | None, stop_ns: int | None
+    ) -> Iterator[Message]:
+        return self._chosen(block, (), channels, start_ns, stop_ns)
+
+    def _chosen(
+        self,
+        block: Block,
+        ahead: Collection[McapBlock],
+        channels: Collection[Channel],
+        start_ns: int | None,
+        stop_ns: int | None,
+    ) -> Iterator[Message]:
+        assert isinstance(block, McapBlock)
+        unpacked = self._load(block, ahead)
+        if unpacked.withheld:
+            return iter(())
+        wanted = {number: channel for number, channel in block.segment.channels.items() if channel in channels}
+        walked = walk(unpacked.records, block.segment, wanted)
+        messages = walked.messages
+        self._compare(block, walked, sum(block.counts.get(channel, 0) for channel in wanted.values()))
+        if not walked.ordered:
+            messages.sort(key=lambda message: message.log_ns)
+        if start_ns is not None and block.first_ns < start_ns:
+            messages = [message for message in messages if message.log_ns >= start_ns]
+        if stop_ns is not None and block.last_ns >= stop_ns:
+            messages = [message for message in messages if message.log_ns < stop_ns]
+        return iter(messages)
+
+    def _compare(self, block: McapBlock, walked: Walked, expected: int) -> None:
+        """Report what of a block's messages does not agree with its index."""
+        span, found = (block.offset, block.offset), walked.messages
+        if walked.fault and not block.torn:
+            self.report(Cause.CUT, walked.fault, *span)
+        if len(found) != expected and not block.torn:
+            self.report(Cause.COUNT, f"a chunk's index lists {expected} messages and {len(found)} are there", *span)
+        if found and (found[0].log_ns < block.first_ns or found[-1].log_ns > block.last_ns):
+            self.report(Cause.ORDER, "a chunk holds messages of other times than it states", *span)
+
+    def sources(
+        self, channels: Collection[Channel], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterable[Source]:
+        """One source a block that holds one of the channels and overlaps the range, see `MessageLog.sources`."""
+        wanted = frozenset(channels)
+        blocks = [
+            block
+            for block in sorted(self._blocks, key=lambda block: block.first_ns)
+            if isinstance(block, McapBlock)
+            and (start_ns is None or block.last_ns >= start_ns)
+            and (stop_ns is None or block.first_ns < stop_ns)
+            and not wanted.isdisjoint(block.counts)
+        ]
+        for place, block in enumerate(blocks):
+            ahead = blocks[place + 1 : place + 1 + READ_AHEAD] if place else ()
+
+            def open_it(block: McapBlock = block, ahead: Collection[McapBlock] = ahead) -> Iterator[Message]:
+                return self._chosen(block, ahead, wanted, start_ns, stop_ns)
+
+            yield Source(block.first_ns, open_it, block.last_ns)
+
+    def add_block(self, block: McapBlock) -> None:
+        """Take a block that a scan found."""
+        self._blocks.append(block)
+
+    def close(self) -> None:
+        """Release the file; images that are still held keep their part of it."""
+        if self._thread is not None:
+            self._thread.shutdown(wait=True, cancel_futures=True)
+        self._unpacked.clear()
+        try:
+            self.view.release()
+            self._map.close()
+        except BufferError:
+            pass

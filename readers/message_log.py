@@ -9,6 +9,7 @@ from __future__ import annotations
 import abc
 import bz2
 import heapq
+import threading
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
@@ -22,8 +23,16 @@ import zstandard
 from readers.salvage import Loss
 from readers.streams import Damage
 
+try:  # the same checksum, four times as fast
+    from isal.isal_zlib import crc32 as crc32  # type: ignore[import-not-found, unused-ignore]
+except ImportError:
+    from zlib import crc32 as crc32
+
 Buffer = bytes | memoryview
 LARGEST_BLOCK_BYTES = 2**30
+LARGEST_UNPACKED_BYTES = 2**28
+LARGEST_RATIO = 1024
+HARMLESS_BYTES = 2**24
 
 
 class DamagedBlockError(Exception):
@@ -75,36 +84,47 @@ class Opener(Protocol):
 
 
 class Source(NamedTuple):
-    """Messages in the order of the log time, none before `first_ns`, not read before `open` is called."""
+    """Messages in the order of the log time, none before `first_ns`, not read before `open` is called.
+
+    None comes after `last_ns`, where that is known.
+    """
 
     first_ns: int
     open: Opener
+    last_ns: int | None = None
 
 
 def in_log_order(sources: Iterable[Source]) -> Iterator[Message]:
     """Merge sources by log time; a source is opened when the merge has come to its first time.
 
-    So memory is bounded by the sources that overlap in time. Equal times keep the order of the sources.
+    So memory is bounded by the sources that overlap in time. Equal times keep the order of the sources. A source
+    that overlaps no other is passed on as it is.
     """
+    ordered = sorted(enumerate(sources), key=lambda pair: pair[1].first_ns)
     heap: list[tuple[int, int, Message, Iterator[Message]]] = []
-
-    def advance() -> Message:
-        _, number, message, rest = heap[0]
-        following = next(rest, None)
-        if following is None:
-            heapq.heappop(heap)
-        else:
-            heapq.heapreplace(heap, (following.log_ns, number, following, rest))
-        return message
-
-    for number, source in enumerate(sorted(sources, key=lambda s: s.first_ns)):
+    for place, (number, source) in enumerate(ordered):
+        following_ns = ordered[place + 1][1].first_ns if place + 1 < len(ordered) else None
         while heap and heap[0][0] < source.first_ns:
-            yield advance()
+            yield _advance(heap)
+        if not heap and (following_ns is None or (source.last_ns is not None and source.last_ns < following_ns)):
+            yield from source.open()
+            continue
         messages = source.open()
         if (first := next(messages, None)) is not None:
             heapq.heappush(heap, (first.log_ns, number, first, messages))
     while heap:
-        yield advance()
+        yield _advance(heap)
+
+
+def _advance(heap: list[tuple[int, int, Message, Iterator[Message]]]) -> Message:
+    """Take the earliest message from the heap and put the next one of its source in its place."""
+    _, number, message, rest = heap[0]
+    following = next(rest, None)
+    if following is None:
+        heapq.heappop(heap)
+    else:
+        heapq.heapreplace(heap, (following.log_ns, number, following, rest))
+    return message
 
 
 class MessageLog(abc.ABC):
@@ -169,14 +189,55 @@ class Block:
         return frozenset(self.counts)
 
 
-class BlockLog(MessageLog):
+class IndexedLog(MessageLog):
+    """A log whose messages lie in blocks, of each of which it is known what it holds."""
+
+    def __init__(self, path: Path, form: str) -> None:
+        super().__init__(path, form)
+        self._blocks: list[Block] = []
+
+    @abc.abstractmethod
+    def _select(
+        self, block: Block, channels: Collection[Channel], start_ns: int | None, stop_ns: int | None
+    ) -> Iterator[Message]:
+        """Messages of `channels` in the block with ``start_ns <= log time < stop_ns``, in the order of log time."""
+
+    def sources(
+        self, channels: Collection[Channel], start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterable[Source]:
+        """One source a block that holds one of the channels and overlaps the range."""
+        wanted = frozenset(channels)
+        for block in self._blocks:
+            if start_ns is not None and block.last_ns < start_ns:
+                continue
+            if stop_ns is not None and block.first_ns >= stop_ns:
+                continue
+            if wanted & block.channels:
+                yield Source(block.first_ns, partial(self._select, block, wanted, start_ns, stop_ns), block.last_ns)
+
+    def count_before(self, channels: Collection[Channel], stop_ns: int) -> int:
+        """How many messages of `channels` were logged before `stop_ns`, by the index for all but the last blocks.
+
+        The messages of a damaged block that has an index are counted, so that the later ones keep their numbers.
+        """
+        wanted, total = frozenset(channels), 0
+        for block in self._blocks:
+            if block.first_ns >= stop_ns or not wanted & block.channels:
+                continue
+            if block.last_ns < stop_ns:
+                total += sum(block.counts.get(channel, 0) for channel in wanted)
+            else:
+                total += sum(1 for _ in self._select(block, wanted, None, stop_ns))
+        return total
+
+
+class BlockLog(IndexedLog):
     """A log whose messages lie in blocks, each with a known range of log times."""
 
     def __init__(self, path: Path, form: str) -> None:
         super().__init__(path, form)
         self._file: BinaryIO = path.open("rb")
         self._size = path.stat().st_size
-        self._blocks: list[Block] = []
         self._latest: tuple[Block | None, list[Message]] = (None, [])
         self._reported: set[int] = set()
 
@@ -251,68 +312,72 @@ class BlockLog(MessageLog):
                 continue
             yield message
 
-    def sources(
-        self, channels: Collection[Channel], start_ns: int | None = None, stop_ns: int | None = None
-    ) -> Iterable[Source]:
-        """One source a block that holds one of the channels and overlaps the range."""
-        wanted = frozenset(channels)
-        for block in self._blocks:
-            if start_ns is not None and block.last_ns < start_ns:
-                continue
-            if stop_ns is not None and block.first_ns >= stop_ns:
-                continue
-            if wanted & block.channels:
-                yield Source(block.first_ns, partial(self._select, block, wanted, start_ns, stop_ns))
-
-    def count_before(self, channels: Collection[Channel], stop_ns: int) -> int:
-        """How many messages of `channels` were logged before `stop_ns`, by the index for all but the last blocks.
-
-        The messages of a damaged block that has an index are counted, so that the later ones keep their numbers.
-        """
-        wanted, total = frozenset(channels), 0
-        for block in self._blocks:
-            if block.first_ns >= stop_ns or not wanted & block.channels:
-                continue
-            if block.last_ns < stop_ns:
-                total += sum(block.counts.get(channel, 0) for channel in wanted)
-            else:
-                total += sum(1 for _ in self._select(block, wanted, None, stop_ns))
-        return total
-
     def close(self) -> None:
         """Release the file."""
         self._latest = (None, [])
         self._file.close()
 
 
-def inflate(compression: str, data: Buffer, size: int, *, torn: bool = False) -> Buffer:
-    """Unpack a chunk of `size` bytes; of a torn one as much as there is.
+class _Codecs(threading.local):
+    """Decompressors, which are made once for each thread."""
 
-    No more than `size` bytes are ever unpacked, so a false claim in the data costs no memory.
+    def __init__(self) -> None:
+        self.zstd = zstandard.ZstdDecompressor()
+        self.lz4 = lz4.frame.LZ4FrameDecompressor()
+
+
+_codecs = _Codecs()
+
+
+def inflate(compression: str, data: Buffer, size: int, *, torn: bool = False, exact: bool = True) -> Buffer:
+    """Unpack a chunk that claims `size` bytes; of a torn one as much as there is.
+
+    However large the claim, no more is unpacked than `LARGEST_UNPACKED_BYTES`, nor, beyond `HARMLESS_BYTES`, than
+    `LARGEST_RATIO` times the packed bytes.
 
     Raises:
-        DamagedBlockError: unknown compression, damaged data, or another size than the chunk states.
+        DamagedBlockError: unknown compression, damaged data, more than is unpacked, or, where it is to be `exact`,
+            another size than the claim.
     """
     if compression in ("", "none"):
         return data
-    if size > LARGEST_BLOCK_BYTES:
-        raise DamagedBlockError(
-            f"a chunk claims {size} bytes, more than the {LARGEST_BLOCK_BYTES} that are unpacked at once"
-        )
+    if compression not in ("zstd", "lz4", "bz2"):
+        raise DamagedBlockError(f"a chunk has the unknown compression {compression[:40]!r}")
+    limit = min(LARGEST_UNPACKED_BYTES, max(HARMLESS_BYTES, LARGEST_RATIO * len(data)))
+    if exact and size > limit:
+        raise DamagedBlockError(f"a chunk claims {size} bytes, more than the {limit} that are unpacked at once")
     try:
-        if compression == "zstd":
-            found = zstandard.ZstdDecompressor().stream_reader(data).read(size + 1)
-        elif compression == "lz4":
-            found = lz4.frame.LZ4FrameDecompressor().decompress(data, max_length=size + 1)
-        elif compression == "bz2":
-            found = bz2.BZ2Decompressor().decompress(data, size + 1)
-        else:
-            raise DamagedBlockError(f"a chunk has the unknown compression {compression!r}")
+        found = _unpack(compression, data, size, limit, torn)
     except (zstandard.ZstdError, RuntimeError, OSError, EOFError, ValueError, MemoryError) as error:
         raise DamagedBlockError(f"a {compression} chunk cannot be unpacked ({error})") from error
-    if len(found) != size and not torn:
+    if len(found) > limit:
+        raise DamagedBlockError(f"a {compression} chunk holds more than the {limit} bytes that are unpacked at once")
+    if exact and len(found) != size and not torn:
         raise DamagedBlockError(f"a {compression} chunk states {size} bytes and holds {len(found)}")
     return memoryview(found)
+
+
+def _unpack(compression: str, data: Buffer, size: int, limit: int, torn: bool) -> bytes:
+    """Unpack up to one byte more than `limit`; the size that is claimed serves to unpack in one go."""
+    if compression == "bz2":
+        return bz2.BZ2Decompressor().decompress(data, min(size, limit) + 1)
+    if compression == "lz4":
+        _codecs.lz4.reset()
+        found: bytes = _codecs.lz4.decompress(data, max_length=min(size, limit) + 1)
+        if not _codecs.lz4.eof and len(found) <= limit and not torn:
+            found += _codecs.lz4.decompress(b"", max_length=limit + 1 - len(found))
+            if not _codecs.lz4.eof and len(found) <= limit:
+                raise EOFError("its end is missing")
+        return found
+    stated = zstandard.frame_content_size(data) if not torn else -1
+    if 0 <= stated == size <= limit:
+        return _codecs.zstd.decompress(data)
+    pieces, total = [], 0
+    with _codecs.zstd.stream_reader(data, read_across_frames=True) as stream:
+        while total <= limit and (piece := stream.read(min(1 << 20, limit + 1 - total))):
+            pieces.append(piece)
+            total += len(piece)
+    return b"".join(pieces)
 
 
 def text(raw: Buffer) -> str:

@@ -414,8 +414,18 @@ def twice(data: bytes) -> bytes:
     return data + data
 
 
-CHUNK_LOST = {"flip_in_chunk", "unknown_compression", "huge_claim"}
-ALL_READ = {"huge_record", "bad_summary_offset", "bad_summary_crc", "garbage_after", "last_byte", "twice"}
+CHUNK_LOST = {"flip_in_chunk"}
+ALL_READ = {
+    "unknown_compression",  # the chunk index knows the right one
+    "huge_claim",
+    "huge_record",
+    "huge_record_without_index",
+    "bad_summary_offset",
+    "bad_summary_crc",
+    "garbage_after",
+    "twice",
+}
+SILENT = {"huge_record"}  # nothing of the chunk's own record header is needed where there is an index
 
 
 @pytest.mark.parametrize(
@@ -443,10 +453,10 @@ def test_damage_is_said_and_costs_only_itself(tmp_path: Path, harm: Bytes) -> No
         found = [(m.channel.topic, m.log_ns, bytes(m.data)) for m in everything(recording)]
         assert set(found) <= known
         survey(recording)
+        assert bool(recording.damage) is (harm.__name__ not in SILENT)
         if harm.__name__ in ALL_READ:
-            assert len(found) == len(raws)
+            assert len(found) == len(raws) * (2 if harm is twice else 1)
         else:
-            assert recording.damage
             assert "byte" in str(recording.damage[0])
             assert 0 < len(found) < len(raws)
         if harm.__name__ in CHUNK_LOST:
@@ -476,8 +486,10 @@ def test_messages_of_an_undescribed_channel_are_counted(tmp_path: Path) -> None:
     path.write_bytes(whole[:at] + b"\x7f" + whole[at + 1 :])
     with open_recording(path) as recording:
         assert "/imu" not in {s.name for s in recording.streams}
-        assert all("messages are of channels that the file does not describe" in d.what for d in recording.damage)
-        assert sum(int(d.what.split()[0]) for d in recording.damage) == 20
+        texts = [harm.what for harm in recording.damage]
+        assert any("unknown kind 0x7f" in text for text in texts)
+        strangers = [text for text in texts if "messages are of channels that the file does not describe" in text]
+        assert sum(int(text.split()[0]) for text in strangers) == 20
         assert recording.stream("/odom").count == 4
 
 

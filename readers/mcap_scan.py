@@ -1,0 +1,324 @@
+"""A walk over the records of an MCAP file whose index is missing or wrong, past whatever is damaged.
+
+No length is believed that does not lead to another record. Where the records break off, the next place is searched
+from which several records follow each other.
+"""
+
+from __future__ import annotations
+
+from collections import Counter
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from readers.mcap_records import (
+    FOOTER,
+    HEAD,
+    MAGIC,
+    SHORTEST,
+    Opcode,
+    RecordError,
+    Segment,
+    Stated,
+    known,
+    read_channel,
+    read_chunk_head,
+    read_message_index,
+    read_schema,
+    walk,
+)
+from readers.message_log import Channel, crc32
+from readers.salvage import Cause, Tally
+
+if TYPE_CHECKING:
+    from readers.mcap_log import McapBlock, McapLog
+
+RUN_BYTES = 1 << 20
+WINDOW_BYTES = 1 << 22
+CHAIN = 3
+_PLAUSIBLE = np.zeros(256, bool)
+_PLAUSIBLE[[*SHORTEST]] = True
+_UNREADABLE = "bytes that are no records were passed over"
+
+
+class Scan:
+    """One walk over a file, which gives its blocks to the log.
+
+    Args:
+        log: the file.
+        segment: what its summary describes, as far as that is sound.
+        fault: what is wrong with the index, "" if there simply is none.
+    """
+
+    def __init__(self, log: McapLog, segment: Segment, fault: str) -> None:
+        self.log, self.segment, self.fault = log, segment, fault
+        self.view, self.size = log.view, len(log.view)
+        self.run_start = -1
+        self.closed = False
+        self.unchecked = 0
+        self.cost: Counter[Channel] = Counter()
+
+    def run(self) -> None:
+        """Walk from the first record to the end of the file."""
+        self.log.notes.append("The file has no usable index; it was read once to list what it holds.")
+        losses = len(self.log.losses)
+        at = len(MAGIC)
+        while at < self.size:
+            at = self._step(at)
+        self._end_run(self.size)
+        self._report_end(len(self.log.losses) > losses)
+
+    # ------------------------------------------------------------------------------- steps
+
+    def _step(self, at: int) -> int:
+        """Take what lies at `at`; where the next record begins."""
+        opcode, end = self._head(at)
+        if opcode == Opcode.MESSAGE and self._leads_on(end):
+            if self.run_start >= 0 and end - self.run_start > RUN_BYTES:
+                self._end_run(at)
+            self.run_start = at if self.run_start < 0 else self.run_start
+            return end
+        self._end_run(at)
+        if opcode == Opcode.FOOTER:
+            return self._footer(at, end)
+        if opcode == Opcode.CHUNK:
+            return self._chunk(at, end)
+        if opcode and self._leads_on(end) and self._take(at, opcode, end):
+            return end
+        return self._passed_over(at)
+
+    def _head(self, at: int) -> tuple[int, int]:
+        """Kind and end of the record at `at`; kind 0 where none can be."""
+        if at + HEAD.size > self.size:
+            return 0, self.size
+        opcode, length = HEAD.unpack_from(self.view, at)
+        return (opcode if known(opcode, length) else 0), at + HEAD.size + length
+
+    def _leads_on(self, at: int) -> bool:
+        """Whether at `at` the file ends or another record can begin, be it cut."""
+        if at >= self.size:
+            return at == self.size
+        if at + HEAD.size > self.size:
+            return self.view[at] in SHORTEST or self.view[at] == MAGIC[0]
+        return bool(self._head(at)[0]) or self.view[at : at + len(MAGIC)] == MAGIC
+
+    def _take(self, at: int, opcode: int, end: int) -> bool:
+        """Take a record that is neither message nor chunk; False if it cannot be what it says."""
+        body = self.view[at + HEAD.size : end]
+        try:
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                if not self.log.describe(self.segment, opcode, body):
+                    self.log.report(Cause.SCHEMA, "a schema or channel is described in two ways", at, at)
+            elif opcode == Opcode.MESSAGE_INDEX:
+                read_message_index(body)
+            elif opcode == Opcode.DATA_END:
+                self._data_end(at, body)
+            elif opcode not in SHORTEST and not self.closed:
+                self.log.report(Cause.CODEC, f"a record of the unknown kind {opcode:#x} was passed over", at, end)
+        except RecordError:
+            return False
+        return True
+
+    def _data_end(self, at: int, body: memoryview) -> None:
+        """Compare the whole data section with its checksum where messages have none of their own."""
+        stated = int.from_bytes(body[:4], "little")
+        if stated and self.unchecked and crc32(self.view[self.segment.start : at]) != stated:
+            text = f"the data do not match their checksum; {self.unchecked} messages have no other and may be wrong"
+            self.log.report(Cause.CHECKSUM, text, self.segment.start, self.segment.start)
+        self.closed = True
+
+    def _footer(self, at: int, end: int) -> int:
+        """The end of one file; where another one begins that was joined to it."""
+        end = at + FOOTER.size - len(MAGIC)
+        if self.view[end : end + len(MAGIC)] != MAGIC:
+            if end + len(MAGIC) <= self.size and not self._leads_on(end):
+                return self._passed_over(at)
+            return self.size
+        self.closed = True
+        end += len(MAGIC)
+        if end == self.size:
+            return end
+        if self.view[end : end + len(MAGIC)] != MAGIC:
+            found = self.log.find(MAGIC, end)
+            text = f"{(found if found >= 0 else self.size) - end} bytes follow after the end of the log"
+            self.log.report(Cause.CUT, text, end, found if found >= 0 else self.size)
+            if found < 0:
+                return self.size
+            end = found
+        return self._joined(end)
+
+    def _joined(self, at: int) -> int:
+        """Begin with another file that was joined to this one."""
+        self.log.report(Cause.ORDER, "another log begins; the two were joined and both are read", at, at)
+        self.segment = Segment(start=at, profile=self.log.profile(at))
+        self.closed, self.unchecked = False, 0
+        return at + len(MAGIC)
+
+    # ------------------------------------------------------------------------------ blocks
+
+    def _end_run(self, end: int) -> None:
+        if self.run_start >= 0:
+            start, self.run_start = self.run_start, -1
+            self.unchecked += self._block(start, end, chunk=False)
+
+    def _chunk(self, at: int, end: int) -> int:
+        """Take the chunk at `at`, by its own length where that of the record leads nowhere."""
+        body = self.view[at + HEAD.size :]
+        try:
+            head = read_chunk_head(body)
+        except RecordError:
+            return self._passed_over(at)
+        inner = at + HEAD.size + head.stop
+        if end <= self.size and inner <= end and self._leads_on(end):
+            self._block(at, end)
+            return end
+        if inner <= self.size and self._leads_on(inner):
+            self.log.report(Cause.LIMIT, "the length of a chunk record is wrong; the chunk's own served", at, at)
+            self._block(at, inner)
+            return inner
+        if end > self.size and inner > self.size and self._search(at + 1, chunks_only=True) < 0:
+            count = self._block(at, self.size, torn=True)
+            text = f"the file ends inside a chunk, {count} messages of which are read without a checksum"
+            self.log.report(Cause.CUT, text, at, self.size)
+            return self.size
+        return self._passed_over(at)
+
+    def _block(self, start: int, end: int, *, chunk: bool = True, torn: bool = False) -> int:
+        """Read a block once, count what it holds and give it to the log; the number of its messages."""
+        from readers.mcap_log import McapBlock
+
+        stated = None
+        if chunk:
+            head = read_chunk_head(self.view[start + HEAD.size : end])
+            stated = Stated(head.compression, head.stop - head.start, head.unpacked_bytes)
+        block = McapBlock(start, end - start, 0, 0, {}, torn, segment=self.segment, chunk=chunk, stated=stated)
+        unpacked = self.log.unpack(block)
+        if unpacked.withheld:
+            counts, times = self._listed(end)
+            self.cost.update(counts)
+            withheld = {channel.topic: Tally(withheld=count) for channel, count in counts.items()}
+            for what, fault in unpacked.faults:
+                self.log.report(what, fault, start, end, withheld, times)
+            return 0
+        for what, fault in unpacked.faults:
+            self.log.report(what, fault, start, start)
+        return self._count(start, end, block, unpacked.records, checked=bool(unpacked.crc) and not torn)
+
+    def _count(self, start: int, end: int, block: McapBlock, records: memoryview, *, checked: bool) -> int:
+        self._describe_inside(start, records)
+        walked = walk(records, self.segment, self.segment.channels)
+        if walked.fault and not block.torn:
+            self.log.report(Cause.CUT, walked.fault, start, start)
+        if walked.strangers:
+            text = f"{walked.strangers.total()} messages are of channels that the file does not describe"
+            self.log.report(Cause.SCHEMA, text, start, end)
+        for message in walked.messages:
+            message.channel.note(message.log_ns)
+        if walked.messages:
+            times = [message.log_ns for message in walked.messages]
+            self.log.add_block(block.of(min(times), max(times), Counter(m.channel for m in walked.messages)))
+        if block.chunk and not checked:
+            self.unchecked += len(walked.messages)
+        return len(walked.messages)
+
+    def _describe_inside(self, start: int, records: memoryview) -> None:
+        """Take the schemas and channels inside of a chunk; a chunk in it is refused."""
+        for opcode, body in walk(records, self.segment, {}).others:
+            try:
+                if opcode == Opcode.CHUNK:
+                    self.log.report(Cause.CODEC, "a chunk inside of a chunk was passed over", start, start)
+                elif not self.log.describe(self.segment, opcode, body):
+                    self.log.report(Cause.SCHEMA, "a schema or channel is described in two ways", start, start)
+            except RecordError:
+                self.log.report(Cause.SCHEMA, "a schema or channel record cannot be parsed", start, start)
+
+    def _listed(self, at: int) -> tuple[Counter[Channel], tuple[int, int]]:
+        """What the message indexes that begin at `at` list: messages by channel, first and last log time."""
+        counts: Counter[Channel] = Counter()
+        times: list[int] = []
+        while (head := self._head(at))[0] == Opcode.MESSAGE_INDEX and head[1] <= self.size:
+            try:
+                number, entries = read_message_index(self.view[at + HEAD.size : head[1]])
+            except RecordError:
+                break
+            if (channel := self.segment.channels.get(number)) is not None and len(entries):
+                counts[channel] += len(entries)
+                times += [int(entries["log_ns"].min()), int(entries["log_ns"].max())]
+            at = head[1]
+        return counts, (min(times, default=-1), max(times, default=-1))
+
+    # ------------------------------------------------------------------------------ search
+
+    def _passed_over(self, at: int) -> int:
+        """Report what lies between `at` and the next record, and go on there."""
+        found = self._search(at + 1)
+        end = found if found >= 0 else self.size
+        if not self.closed or found >= 0:
+            cut = found < 0 and self._head(at)[0]
+            self.log.report(Cause.CUT, "the file ends inside a record" if cut else _UNREADABLE, at, end)
+        if self.view[end : end + len(MAGIC)] == MAGIC and end + len(MAGIC) < self.size:
+            return self._joined(end)
+        return end
+
+    def _search(self, start: int, *, chunks_only: bool = False) -> int:
+        """The first place from `start` on from which several records follow each other, -1 if there is none."""
+        magic = self.log.find(MAGIC, start)
+        stop = magic if 0 <= magic < self.size - len(MAGIC) else self.size
+        for window in range(start, stop, WINDOW_BYTES):
+            raw = np.frombuffer(self.view[window : min(window + WINDOW_BYTES + HEAD.size, stop)], np.uint8)
+            if len(raw) < HEAD.size:
+                break
+            short = raw[5:-3] | raw[6:-2] | raw[7:-1] | raw[8:]
+            for place in np.flatnonzero(_PLAUSIBLE[raw[: len(short)]] & (short == 0)):
+                at = window + int(place)
+                if (not chunks_only or self.view[at] == Opcode.CHUNK) and self._begins(at):
+                    return at
+        return stop if stop < self.size else -1
+
+    def _begins(self, at: int) -> bool:
+        """Whether records follow each other from `at` on, the first of which can be parsed."""
+        opcode, end = self._head(at)
+        if end > self.size:
+            return False
+        body = self.view[at + HEAD.size : end]
+        try:
+            if opcode == Opcode.CHUNK:
+                head = read_chunk_head(body)
+                return head.stop <= len(body) and self._leads_on(end)
+            if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
+                (read_schema if opcode == Opcode.SCHEMA else read_channel)(body)
+            elif opcode == Opcode.MESSAGE_INDEX:
+                read_message_index(body)
+            elif opcode == Opcode.MESSAGE and int.from_bytes(body[:2], "little") not in self.segment.channels:
+                return False
+        except RecordError:
+            return False
+        for _ in range(CHAIN):
+            if end == self.size or self.view[end : end + len(MAGIC)] == MAGIC:
+                return True
+            opcode, end = self._head(end)
+            if not opcode or end > self.size:
+                return False
+        return True
+
+    # --------------------------------------------------------------------------------- end
+
+    def _report_end(self, lost: bool) -> None:
+        """Report how the file ends, and where its own counts differ from what was found."""
+        if not self.closed:
+            self.log.report(
+                Cause.CUT, "the file was not closed, what is there can be read; it breaks off", self.size, self.size
+            )
+        elif self.fault:
+            self.log.report(Cause.CUT, f"{self.fault}; the file was read without it", self.size, self.size)
+        statistics = self.log.statistics
+        if statistics is None or self.segment.start:
+            return
+        missing = Counter({c: statistics.counts.get(n, 0) for n, c in self.segment.channels.items()})
+        missing.subtract(self.cost)
+        missing.subtract({channel: channel.count for channel in self.segment.channels.values()})
+        found = sum(channel.count for channel in self.segment.channels.values()) + self.cost.total()
+        if any(missing.values()) or statistics.messages != found:
+            text = f"the file claims {statistics.messages} messages and {found} were found"
+            lost_counts = {c.topic: Tally(lost=count) for c, count in missing.items() if count > 0}
+            self.log.report(Cause.COUNT, text, -1, -1, lost_counts if lost else None)
