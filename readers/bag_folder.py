@@ -4,6 +4,8 @@ from __future__ import annotations
 
 import re
 import shutil
+from collections import Counter
+from collections.abc import Mapping, Sequence
 from pathlib import Path, PurePosixPath
 from tempfile import TemporaryDirectory
 from typing import NamedTuple
@@ -21,11 +23,17 @@ def natural_key(name: str) -> list[tuple[int, str]]:
 
 
 class BagMetadata(NamedTuple):
-    """What a ROS 2 bag's metadata.yaml says: its files (None if it cannot tell) and each topic's serialisation."""
+    """What a ROS 2 bag's metadata.yaml says: its files (None if it cannot tell); serialisation and count by topic."""
 
     files: list[str] | None
-    formats: dict[str, str]
-    remarks: list[str]
+    formats: Mapping[str, str]
+    counts: Mapping[str, int]
+    remarks: Sequence[str]
+
+    @classmethod
+    def missing(cls, *remarks: str) -> BagMetadata:
+        """What is known without it."""
+        return cls(None, {}, {}, remarks)
 
 
 def read_metadata(folder: Path) -> BagMetadata:
@@ -35,14 +43,19 @@ def read_metadata(folder: Path) -> BagMetadata:
     """
     metadata = folder / "metadata.yaml"
     if not metadata.is_file():
-        return BagMetadata(None, {}, ["The bag has no metadata.yaml; its files were found by their names."])
+        return BagMetadata.missing("The bag has no metadata.yaml; its files were found by their names.")
     try:
         stated = YAML(typ="safe", pure=True).load(metadata.read_text("utf-8"))["rosbag2_bagfile_information"]
         files = [PurePosixPath(str(name)).name for name in stated["relative_file_paths"]]
-        topics = [entry["topic_metadata"] for entry in stated.get("topics_with_message_count") or ()]
-        return BagMetadata(files, {str(t["name"]): str(t["serialization_format"]) for t in topics}, [])
-    except (YAMLError, UnicodeDecodeError, LookupError, TypeError, AttributeError):
-        return BagMetadata(None, {}, ["metadata.yaml cannot be parsed; the bag's files were found by their names."])
+        entries = stated.get("topics_with_message_count") or ()
+        topics = [entry["topic_metadata"] for entry in entries]
+        formats = {str(topic["name"]): str(topic["serialization_format"]) for topic in topics}
+        counts: Counter[str] = Counter()
+        for topic, entry in zip(topics, entries, strict=True):
+            counts[str(topic["name"])] += int(entry["message_count"])
+        return BagMetadata(files, formats, counts, ())
+    except (YAMLError, ValueError, LookupError, TypeError, AttributeError, RecursionError):
+        return BagMetadata.missing("metadata.yaml cannot be parsed; the bag's files were found by their names.")
 
 
 def unpack(path: Path, scratch: list[TemporaryDirectory[str]]) -> Path:

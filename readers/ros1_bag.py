@@ -35,6 +35,7 @@ _U32 = struct.Struct("<I")
 _TWO_U32 = struct.Struct("<II")
 _U64 = struct.Struct("<Q")
 _CHUNK_MARK = b"\x04\0\0\0op=\x05"
+_MESSAGE_MARK = b"\x04\0\0\0op=\x02"
 _LONGEST_CHUNK_HEADER = 80
 _LONGEST_HEADER = 1 << 20
 _COMPRESSIONS = (b"none", b"bz2", b"lz4")
@@ -136,75 +137,89 @@ class _Layout:
     """A message record up to its data, with the header's fields in one order, for one look at all of it."""
 
     def __init__(self, order: tuple[bytes, ...]) -> None:
-        self.form = struct.Struct("<I" + "".join(_FIELDS[name][0] for name in order) + "I")
+        self._form = struct.Struct("<I" + "".join(_FIELDS[name][0] for name in order) + "I")
         marks, place = {}, 1
         for name in order:
             marks[name] = place
             place += 1 if name == b"op" else 2
-        self.marks = itemgetter(0, *marks.values())
-        self.fixed = (_HEADER_BYTES, *(_FIELDS[name][1] for name in order))
-        self.connection, self.time = marks[b"conn"] + 1, marks[b"time"] + 1
+        self._marks = itemgetter(0, *marks.values())
+        self._fixed = (_HEADER_BYTES, *(_FIELDS[name][1] for name in order))
+        self._values = itemgetter(marks[b"conn"] + 1, marks[b"time"] + 1, -1)
+
+    def read(self, data: memoryview, at: int) -> tuple[Any, ...] | None:
+        """Connection, time and length of the data of the message record at `at`; None if there is none such."""
+        if at + _HEADER_BYTES + 8 > len(data):
+            return None
+        head = self._form.unpack_from(data, at)
+        return self._values(head) if self._marks(head) == self._fixed else None
 
 
 _LAYOUTS = [_Layout(order) for order in permutations(_FIELDS)]
-
-
-def _layout_at(data: memoryview, at: int) -> _Layout | None:
-    """The order of the fields in the message record at `at`, None if it is no plain message record."""
-    if at + _HEADER_BYTES + 8 > len(data):
-        return None
-    return next((one for one in _LAYOUTS if one.marks(one.form.unpack_from(data, at)) == one.fixed), None)
+Item = tuple[int, int, memoryview] | Record
 
 
 class Walk:
-    """The records of a chunk one after the other; `torn` tells afterwards where they broke off, -1 if nowhere."""
+    """The records of a chunk one after the other.
+
+    `torn` tells afterwards where they broke off, -1 if nowhere, and `last` where the record before that begins.
+    """
 
     def __init__(self, data: memoryview, start: int = 0) -> None:
-        self.data, self.start, self.torn = data, start, -1
+        self.data, self.start = data, start
+        self.torn = self.last = -1
 
-    def __iter__(self) -> Iterator[tuple[int, int, memoryview] | Record]:
-        """Of a message its connection, time in ns and data; any other record as it is."""
+    def __iter__(self) -> Iterator[Item]:
+        """Of a message its connection, time in ns and data; a connection's record as it is."""
         data, at, end = self.data, self.start, len(self.data)
-        layout = None
+        layout = _LAYOUTS[0]
         while at < end:
-            head: tuple[Any, ...] = ()
-            if layout is not None and at + _HEADER_BYTES + 8 <= end:
-                head = layout.form.unpack_from(data, at)
-            if layout is None or not head or layout.marks(head) != layout.fixed:
-                layout = _layout_at(data, at)
-                if layout is None:
-                    try:
-                        record = record_at(data, at)
-                        if record.stop > end or record.operation not in (_MESSAGE, _CONNECTION):
-                            raise TornError
-                        if record.operation == _MESSAGE:
-                            yield record.u32(b"conn"), record.time_ns(b"time"), data[record.start : record.stop]
-                        else:
-                            yield record
-                    except TornError:
-                        self.torn = at
-                        return
-                    at = record.stop
-                    continue
-                head = layout.form.unpack_from(data, at)
-            start = at + _HEADER_BYTES + 8
-            at = start + head[-1]
-            if at > end:
-                self.torn = start - _HEADER_BYTES - 8
-                return
-            time = head[layout.time]
-            yield head[layout.connection], (time & 0xFFFFFFFF) * 1_000_000_000 + (time >> 32), data[start:at]
+            head = layout.read(data, at)
+            if head is None:
+                layout = next((one for one in _LAYOUTS if one.read(data, at)), layout)
+                head = layout.read(data, at)
+            if head is None:
+                try:
+                    item, stop = _any_record(data, at)
+                except TornError:
+                    break
+            else:
+                number, time, length = head
+                start = at + _HEADER_BYTES + 8
+                stop = start + length
+                item = (number, (time & 0xFFFFFFFF) * 1_000_000_000 + (time >> 32), data[start:stop])
+            if stop > end:
+                break
+            self.last, at = at, stop
+            yield item
+        self.torn = at if at < end else -1
+
+
+def _any_record(data: memoryview, at: int) -> tuple[Item, int]:
+    """A message or a connection whose header has other fields, or more, and where it ends."""
+    record = record_at(data, at)
+    if record.operation == _CONNECTION:
+        return record, record.stop
+    if record.operation != _MESSAGE:
+        raise TornError
+    return (record.u32(b"conn"), record.time_ns(b"time"), data[record.start : record.stop]), record.stop
 
 
 # ----------------------------------------------------------------------------------------- chunks
 
 
 class Span(NamedTuple):
-    """How many messages of one connection a chunk holds, and their first and last log time."""
+    """Messages of one connection in a chunk: how many, their first and last log time, and the sum of all times."""
 
     messages: int
     first_ns: int
     last_ns: int
+    sum_ns: int
+
+    @classmethod
+    def of(cls, times_ns: NDArray[np.int64]) -> Span:
+        """The span of at least one log time."""
+        from_first = int((times_ns - times_ns[0]).sum()) + int(times_ns[0]) * len(times_ns)
+        return cls(len(times_ns), int(times_ns.min()), int(times_ns.max()), from_first)
 
 
 @dataclass(eq=False, slots=True)
@@ -219,32 +234,42 @@ class Chunk:
         """Log time of its earliest message."""
         return min(span.first_ns for span in self.spans.values())
 
+    @property
+    def last_ns(self) -> int:
+        """Log time of its latest message."""
+        return max(span.last_ns for span in self.spans.values())
+
+    @property
+    def sum_ns(self) -> int:
+        """Sum of all its log times."""
+        return sum(span.sum_ns for span in self.spans.values())
+
 
 class ChunkIndex(NamedTuple):
-    """The index behind a chunk: by connection the log times (ns) and places of its messages; and where it ends."""
+    """The index behind a chunk: by connection the log times (ns) of its messages, and the places of all.
+
+    `complete` where another record follows it.
+    """
 
     times_ns: dict[int, NDArray[np.int64]]
     places: list[int]
-    stop: int
+    complete: bool
 
     @property
     def spans(self) -> dict[int, Span]:
         """What the chunk holds by connection."""
-        return {
-            number: Span(len(times), int(times.min()), int(times.max()))
-            for number, times in self.times_ns.items()
-            if len(times)
-        }
+        return {number: Span.of(times) for number, times in self.times_ns.items() if len(times)}
 
 
 def index_behind(data: memoryview, chunk: Record) -> ChunkIndex:
     """The index records behind a chunk, as far as they are whole."""
     times: dict[int, NDArray[np.int64]] = {}
     places: list[int] = []
-    at = chunk.stop
+    at, complete = chunk.stop, False
     try:
         while at < len(data):
             record = record_at(data, at)
+            complete = record.operation in (_CHUNK, _CONNECTION, _CHUNK_INFO)
             if record.operation != _INDEX or record.stop > len(data):
                 break
             entries = np.frombuffer(data[record.start : record.stop], _ENTRY)
@@ -255,7 +280,7 @@ def index_behind(data: memoryview, chunk: Record) -> ChunkIndex:
             at = record.stop
     except (TornError, ValueError):
         pass
-    return ChunkIndex(times, places, at)
+    return ChunkIndex(times, places, complete)
 
 
 class _ChunkInfo(NamedTuple):
@@ -265,12 +290,11 @@ class _ChunkInfo(NamedTuple):
     last_ns: int
     counts: dict[int, int]
 
-    def fits(self, spans: Mapping[int, Span]) -> bool:
-        """Whether the chunk's own index says the same."""
+    @classmethod
+    def of(cls, spans: Mapping[int, Span]) -> _ChunkInfo:
+        """What it would say of a chunk with that index."""
         times = [time for span in spans.values() for time in (span.first_ns, span.last_ns)]
-        return {n: c for n, c in self.counts.items() if c} == {n: span.messages for n, span in spans.items()} and (
-            not times or (min(times), max(times)) == (self.first_ns, self.last_ns)
-        )
+        return cls(min(times, default=0), max(times, default=0), {n: span.messages for n, span in spans.items()})
 
 
 class Ros1Log(MessageLog):
@@ -289,6 +313,7 @@ class Ros1Log(MessageLog):
         self._by_id: dict[int, Channel] = {}
         self._chunks: list[Chunk] = []
         self._latest: tuple[Chunk | None, list[Message]] = (None, [])
+        self._told: set[tuple[str, int]] = set()
         self._aheads: WeakSet[Ahead[Chunk, Buffer]] = WeakSet()
         if self._data[: len(MAGIC)] != MAGIC:
             raise RecordingError(path, "it is no ROS 1 bag of format 2.0", "check that the file is complete")
@@ -299,6 +324,10 @@ class Ros1Log(MessageLog):
         self._list(records, infos)
 
     def _harm(self, cause: Cause, sentence: str, start: int, stop: int, **known: Any) -> None:
+        """Note a loss, once for each place: what is read again is not lost again."""
+        if (sentence, start) in self._told:
+            return
+        self._told.add((sentence, start))
         self.lose(Loss(what=cause, text=sentence, start=start, stop=stop, file_bytes=self._size, **known))
 
     # --------------------------------------------------------------------------- the records
@@ -337,18 +366,17 @@ class Ros1Log(MessageLog):
                 at = record.stop
             except TornError:
                 following = self._next_chunk(at + 1)
-                ends = (
-                    "the file ends inside a record" if following == self._size else "no record begins where one should"
-                )
+                whole = following < self._size
+                ends = "no record begins where one should" if whole else "no record can be read from here to the end"
                 self._harm(Cause.CUT, ends, at, following)
+                chunks += self._bare_messages(at, following)
                 at = following
         return chunks, infos
 
     def _chunk(self, record: Record) -> Record:
         """A chunk's record; where it reaches beyond the end of the file it stops at the next chunk or the end."""
-        if record.fields.get(b"compression") not in _COMPRESSIONS:
-            named = text(record.fields.get(b"compression", b""))
-            self._harm(Cause.CODEC, f"a chunk has the unknown compression {named!r}", record.offset, record.stop)
+        if b"compression" not in record.fields:
+            raise TornError
         record.u32(b"size")
         if record.stop <= self._size:
             return record
@@ -374,6 +402,17 @@ class Ros1Log(MessageLog):
             mark = self._map.find(_CHUNK_MARK, mark + 1)
         return self._size
 
+    def _bare_messages(self, start: int, stop: int) -> Iterator[Record]:
+        """What is left of an uncompressed chunk without its head, as a torn chunk: from the first message on."""
+        mark = self._map.find(_MESSAGE_MARK, start, stop)
+        while mark >= 0:
+            for at in range(max(start, mark - _HEADER_BYTES), mark):
+                if any(layout.read(self._data, at) for layout in _LAYOUTS):
+                    fields = {b"compression": b"none", b"size": _U32.pack(min(stop - at, 2**32 - 1))}
+                    yield Record(start, _CHUNK, fields, at, stop, torn=True)
+                    return
+            mark = self._map.find(_MESSAGE_MARK, mark + 1, stop)
+
     def _connect(self, record: Record, data: memoryview, base: int = 0) -> None:
         """Take a connection record as a channel.
 
@@ -394,6 +433,13 @@ class Ros1Log(MessageLog):
         elif (known.topic, known.type, known.schema) != (channel.topic, channel.type, channel.schema):
             words = f"connection {number} is described twice, differently ({known.topic} and {channel.topic})"
             self._harm(Cause.SCHEMA, words, base or record.offset, base or record.offset)
+
+    def _connect_within(self, chunk: Chunk, record: Record, data: memoryview) -> None:
+        try:
+            self._connect(record, data, chunk.record.offset)
+        except TornError:
+            start = chunk.record.offset
+            self._harm(Cause.SCHEMA, "the description of a connection in a chunk is damaged", start, start)
 
     # --------------------------------------------------------------------------- what there is
 
@@ -416,14 +462,14 @@ class Ros1Log(MessageLog):
     def _list(self, records: list[Record], infos: dict[int, _ChunkInfo]) -> None:
         """Find out what each chunk holds: from its index where the chunk info agrees, else from itself."""
         for record in records:
-            info, index = infos.pop(record.offset, None), index_behind(self._data, record)
-            chunk = Chunk(record, index.spans)
-            believed = info.fits(index.spans) if info else bool(index.spans) and self._is_record(index.stop)
+            index = index_behind(self._data, record)
+            chunk, own = Chunk(record, index.spans), _ChunkInfo.of(index.spans)
+            info = infos.pop(record.offset, None)
+            if info is None and (place := next((p for p, i in infos.items() if i == own), None)) is not None:
+                info = infos.pop(place)
+            believed = info == own if info else bool(index.spans) and index.complete
             if record.torn or not believed or not chunk.spans.keys() <= self._by_id.keys():
-                stated = (
-                    {n: Span(c, -1, -1) for n, c in info.counts.items()} if info else index.spans if believed else {}
-                )
-                chunk.spans = self._look_into(chunk, stated)
+                chunk.spans = self._look_into(chunk, index.spans if believed else _announced(info))
             if chunk.spans:
                 self._chunks.append(chunk)
         for place, info in infos.items():
@@ -438,12 +484,6 @@ class Ros1Log(MessageLog):
                 channel.first_ns = span.first_ns if channel.first_ns < 0 else min(channel.first_ns, span.first_ns)
                 channel.last_ns = max(channel.last_ns, span.last_ns)
 
-    def _is_record(self, offset: int) -> bool:
-        try:
-            return record_at(self._data, offset).operation in (_CHUNK, _CONNECTION, _CHUNK_INFO)
-        except TornError:
-            return False
-
     def _look_into(self, chunk: Chunk, stated: Mapping[int, Span]) -> dict[int, Span]:
         """What a chunk really holds, by connection; what it should hold is `stated`."""
         chunk.spans = dict(stated)
@@ -455,7 +495,7 @@ class Ros1Log(MessageLog):
                 numbers = {channel: number for number, channel in self._by_id.items()}
                 number = numbers[message.channel]
             times.setdefault(number, []).append(message.log_ns)
-        return {number: Span(len(found), min(found), max(found)) for number, found in times.items()}
+        return {number: Span.of(np.array(found)) for number, found in times.items()}
 
     def _tallies(self, counts: Mapping[int, int], *, withheld: bool = False) -> dict[str, Tally]:
         found: dict[str, Tally] = {}
@@ -497,29 +537,46 @@ class Ros1Log(MessageLog):
         at, broken = 0, ""
         while at >= 0:
             walk = Walk(data, at)
-            for item in walk:
+            items = list(walk)
+            if walk.torn >= 0:
+                broken = "the records of a chunk break off"
+                at = self._after_break(chunk, walk, items)
+            else:
+                at = -1
+            for item in items:
                 if isinstance(item, Record):
-                    self._connect(item, data, chunk.record.offset)
+                    self._connect_within(chunk, item, data)
                     continue
                 number, log_ns, payload = item
                 counts[number] += 1
                 if (channel := self._by_id.get(number)) is not None:
                     found.append(Message(log_ns, channel, payload))
-            if walk.torn < 0:
-                break
-            broken = "the records of a chunk break off"
-            places = index_behind(self._data, chunk.record).places
-            at = min((place for place in places if place > walk.torn), default=-1)
-        self._judge_chunk(chunk, counts, Cause.CUT, "" if chunk.record.torn else broken)
-        if any(one.log_ns > next_one.log_ns for one, next_one in pairwise(found)):
+        total_ns = sum(message.log_ns for message in found)
+        self._judge_chunk(chunk, counts, Cause.CUT, "" if chunk.record.torn else broken, total_ns)
+        if any(one.log_ns > following.log_ns for one, following in pairwise(found)):
             found.sort(key=lambda message: message.log_ns)
         return found
 
-    def _judge_chunk(self, chunk: Chunk, counts: Counter[int], cause: Cause, broken: str) -> None:
-        """Compare what a chunk gave with what it was to hold."""
+    def _after_break(self, chunk: Chunk, walk: Walk, items: list[Item]) -> int:
+        """Where the messages of a chunk go on, by its index, behind the place where they broke off; -1 if nowhere.
+
+        A record that ends where none can begin has a wrong length: it is taken out of `items`, except where the file
+        was cut there.
+        """
+        places = index_behind(self._data, chunk.record).places
+        at = walk.torn
+        cut = chunk.record.torn and chunk.record.stop == self._size
+        if at not in places and walk.last >= 0 and not cut and not _is_record(walk.data, at):
+            items.pop()
+            at = walk.last
+        return min((place for place in places if place > at), default=-1)
+
+    def _judge_chunk(self, chunk: Chunk, counts: Counter[int], cause: Cause, broken: str, sum_ns: int = 0) -> None:
+        """Compare what a chunk gave (messages by connection, sum of their times) with what it was to hold."""
         stated = {number: span.messages for number, span in chunk.spans.items()}
         missing = {number: count - counts[number] for number, count in stated.items() if count > counts[number]}
         strangers = {number: count for number, count in counts.items() if number not in self._by_id}
+        moved = bool(stated) and all(span.sum_ns for span in chunk.spans.values()) and sum_ns != chunk.sum_ns
         surplus = sum(count - stated.get(number, 0) for number, count in counts.items() if stated) > 0
         times = [time for span in chunk.spans.values() for time in (span.first_ns, span.last_ns) if time >= 0]
         known: dict[str, Any] = {"first_ns": min(times), "last_ns": max(times)} if times else {}
@@ -531,8 +588,9 @@ class Ros1Log(MessageLog):
             words = broken or f"a chunk holds {sum(missing.values())} messages fewer than its index states"
             topics = self._tallies(missing, withheld=cause is Cause.CODEC)
             self._harm(cause if broken else Cause.COUNT, words, start, stop, topics=topics, **known)
-        elif surplus and not strangers:
-            self._harm(Cause.COUNT, "a chunk holds other messages than its index states", start, start, **known)
+        elif not strangers and (surplus or moved):
+            words = "a chunk holds other messages, or other times, than its index states"
+            self._harm(Cause.COUNT, words, start, start, **known)
 
     # -------------------------------------------------------------------------------- reading
 
@@ -555,7 +613,7 @@ class Ros1Log(MessageLog):
         low, high = start_ns or 0, stop_ns if stop_ns is not None else _END_OF_TIME
         for chunk in chosen:
             select = partial(self._select, chunk, wanted, low, high, ahead)
-            yield Source(chunk.first_ns, select, max(span.last_ns for span in chunk.spans.values()))
+            yield Source(chunk.first_ns, select, chunk.last_ns)
 
     def _select(
         self, chunk: Chunk, wanted: Collection[Channel], low: int, high: int, ahead: Ahead[Chunk, Buffer]
@@ -588,9 +646,22 @@ class Ros1Log(MessageLog):
         self._chunks = []
 
 
+def _is_record(data: memoryview, offset: int) -> bool:
+    """Whether a record of those outside of chunks begins there."""
+    try:
+        return record_at(data, offset).operation in (_CHUNK, *_BETWEEN_CHUNKS)
+    except TornError:
+        return False
+
+
+def _announced(info: _ChunkInfo | None) -> dict[int, Span]:
+    """What a chunk should hold if its own index cannot be believed; times are unknown."""
+    return {number: Span(count, -1, -1, 0) for number, count in info.counts.items()} if info else {}
+
+
 def _chunk_info(record: Record, data: memoryview) -> _ChunkInfo:
     try:
-        counts = dict(_TWO_U32.iter_unpack(data[record.start : record.stop]))
+        counts = {number: count for number, count in _TWO_U32.iter_unpack(data[record.start : record.stop]) if count}
     except struct.error as error:
         raise TornError from error
     return _ChunkInfo(record.time_ns(b"start_time"), record.time_ns(b"end_time"), counts)

@@ -8,6 +8,7 @@ is read page by page, see `readers.sqlite_pages`.
 from __future__ import annotations
 
 import bisect
+import contextlib
 import mmap
 import re
 import shutil
@@ -87,7 +88,20 @@ class SqliteLog(MessageLog):
         " min(timestamp), max(timestamp) FROM messages GROUP BY 1, 2, 3"
     )
 
+    def _cut(self) -> str:
+        """How the file is too short for the pages that it states, which SQLite fills with zeros; "" if it is not."""
+        with self.path.open("rb") as file:
+            pages = Pages(memoryview(file.read(100)))
+        whole = self._size % pages.page_bytes == 0 and pages.stated * pages.page_bytes <= self._size
+        return "" if whole or self._copy is not None else "the file is cut off"
+
     def _list_channels(self) -> None:
+        if fault := self._cut():
+            with contextlib.suppress(sqlite3.DatabaseError, RecordingError, UnicodeDecodeError, TypeError):
+                self._database.execute("PRAGMA writable_schema = ON")
+                self._read_tables()
+            self._read_pages(fault, listed=False)
+            return
         try:
             self._read_tables()
             counted = list(self._database.execute(self._COUNT))
