@@ -17,7 +17,7 @@ from tempfile import TemporaryDirectory
 import numpy as np
 
 from readers.clock import REORDER_WINDOW_NS, SECOND_NS, merge, reorder, sane_stamp
-from readers.decoding import Decoder, MessageError, decoder_of, definition_text
+from readers.decoding import Decoder, Definitions, MessageError, decoder_of, definition_text
 from readers.message_log import Channel, Message, MessageLog, Source, in_log_order
 from readers.messages import (
     Arrival,
@@ -160,15 +160,15 @@ class LogRecording(Recording):
                 self._look_at(topic)
         return tuple(topics)
 
-    @staticmethod
-    def _topic(name: str, channels: list[Channel]) -> Topic:
+    def _topic(self, name: str, channels: list[Channel]) -> Topic:
         type_name = channels[0].type
         topic = Topic(name=name, channels=channels, reader=reader_of(type_name))
         try:
             if topic.reader is None:
                 topic.reason = f"no reader for type {type_name}" if type_name else "the file has no schema for it"
             for channel in channels:
-                decoder = decoder_of(channel) if topic.reader or channel.encoding not in ("ros1", "cdr") else None
+                known = topic.reader or channel.encoding not in ("ros1", "cdr")
+                decoder = decoder_of(channel, self.definitions) if known else None
                 if decoder is not None and topic.reader is not None:
                     topic.decoders[channel] = decoder
         except MessageError as error:
@@ -274,6 +274,11 @@ class LogRecording(Recording):
     def losses(self) -> tuple[Loss, ...]:
         """What of the files could not be read, as far as they were read by now, in the form that can be counted."""
         return tuple(loss for log in self._logs for loss in log.losses)
+
+    @property
+    def definitions(self) -> Definitions:
+        """Where definitions are looked up that the log does not have."""
+        return Definitions(self._options.distribution, self._options.msg_folder)
 
     @property
     def channels(self) -> tuple[Channel, ...]:

@@ -455,6 +455,9 @@ class Ros1Log(MessageLog):
             self._harm(Cause.CUT, words, self._size, self._size)
         elif place > self._size or (place < self._size and operation not in (_CONNECTION, _CHUNK_INFO)):
             self._harm(Cause.CUT, "the bag header states no place of an index", header.offset, header.offset)
+        elif infos < chunks:
+            words = f"the index describes {infos} of {chunks} chunks, the others are read as they are"
+            self._harm(Cause.CUT, words, self._size, self._size)
         elif stated != chunks:
             words = f"the bag header states {stated} chunks and {chunks} are there"
             self._harm(Cause.COUNT, words, header.offset, header.offset)

@@ -13,10 +13,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from readers.salvage import Loss
 
 FloatArray = NDArray[np.float64]
 
@@ -314,13 +317,17 @@ class ReadOptions:
 
     `rate_hz` is the frame rate of plain frames or a video without times; `times_file` a file with the
     frames' times, in `times_unit` (``s``, ``ms``, ``us``, ``ns`` or ``auto``); `pose_frames` pairs
-    ``parent, child`` whose transforms in ``/tf`` become pose streams (all pairs found if empty).
+    ``parent, child`` whose transforms in ``/tf`` become pose streams (all pairs found if empty). Definitions that
+    a log does not have come from the ROS 2 `distribution` (``humble``; the latest if empty), then from the ``.msg``
+    files of `msg_folder`.
     """
 
     rate_hz: float | None = None
     times_file: Path | None = None
     times_unit: str = "auto"
     pose_frames: tuple[tuple[str, str], ...] = ()
+    distribution: str = ""
+    msg_folder: Path | None = None
 
 
 # -------------------------------------------------------------------------- stream facts
@@ -416,6 +423,11 @@ class Recording(abc.ABC):
     @property
     def damage(self) -> tuple[Damage, ...]:
         """What of the file is damaged, as far as it was read by now."""
+        return ()
+
+    @property
+    def losses(self) -> tuple[Loss, ...]:
+        """The damage in the form that can be counted by topic, of logs of messages."""
         return ()
 
     @abc.abstractmethod

@@ -37,7 +37,6 @@ from workbench.terminal import (
 
 if TYPE_CHECKING:
     from pipelines.simulation.mission import SimulatedMission
-    from readers.salvage import Loss, Tally
     from readers.streams import Camera, ReadOptions, Recording, StreamInfo
     from workbench.reproduce import report as reports_a
     from workbench.reproduce.judged import Statement
@@ -79,6 +78,13 @@ TimeFrames = Annotated[
     list[str] | None,
     typer.Option("--tf", metavar="PARENT,CHILD", help="Pair of frames in /tf to read as a pose stream; repeatable."),
 ]
+MsgFolder = Annotated[
+    Path | None,
+    typer.Option("--msg", metavar="DIR", help="Folder of .msg files for types that the log does not define."),
+]
+Distribution = Annotated[
+    str, typer.Option("--distro", metavar="NAME", help="ROS 2 distribution of types that the log does not define.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 
 
@@ -110,19 +116,31 @@ def inspect(
     times: TimesFile = None,
     times_unit: TimesUnit = "auto",
     tf: TimeFrames = None,
+    msg: MsgFolder = None,
+    distro: Distribution = "",
 ) -> None:
     """Show what is in a recording: streams, cameras, damage, and what is odd about its clocks."""
     from workbench.session import open_any
 
-    with open_any(path, _options(rate, times, times_unit, tf)) as recording:
+    with open_any(path, _options(rate, times, times_unit, tf, msg, distro)) as recording:
         facts = [] if quick else _survey(recording)
-        values = _recording_values(recording, facts)
+        values = _recording_values(recording, facts) | _lost(recording, quick)
         if as_json:
             print_json(values)
         else:
             _print_recording(recording, values)
         if values["damage"]:
             raise typer.Exit(IN_PART)
+
+
+def _lost(recording: Recording, quick: bool) -> dict[str, Any]:
+    """The report of loss, where there is one; unless `quick`, all messages are read for what was recovered."""
+    from workbench import loss_report
+
+    if not recording.losses:
+        return {"loss": None}
+    good = {} if quick else loss_report.read_through(recording)
+    return {"loss": loss_report.values(good, recording.losses)}
 
 
 def _survey(recording: Recording) -> list[dict[str, Any]]:
@@ -193,6 +211,8 @@ def _print_recording(recording: Recording, values: Mapping[str, Any]) -> None:
     print_list("notes", values["notes"])
     print_list("not readable", [_unreadable(info) for info in recording.streams if not info.readable])
     print_list("damage", values["damage"])
+    if values["loss"]:
+        _print_losses(values["loss"])
     print_list("oddities", [f"{fact['stream']}: {fact['sentence']}" for fact in values["facts"]])
 
 
@@ -240,6 +260,8 @@ def recover(
         Path, typer.Argument(metavar="PATH", help="ROS 1 bag, ROS 2 bag or MCAP, or a folder of its parts.")
     ],
     out: Annotated[Path, typer.Option("--out", "-o", metavar="OUT.mcap", help="File to write; it must not exist.")],
+    msg: MsgFolder = None,
+    distro: Distribution = "",
     as_json: AsJson = False,
 ) -> None:
     """Write the readable messages of a log, as they are stored, into an MCAP file with an index; tell what was lost.
@@ -247,60 +269,35 @@ def recover(
     Definitions, encodings and times are kept: messages of ROS 1 stay messages of ROS 1. Ctrl-C ends the file early and
     leaves it readable. Exit status: 0 nothing was damaged, 3 something was lost, 2 nothing can be read.
     """
+    from workbench import loss_report
     from workbench.recovery import recover as write
     from workbench.session import Progress, open_any
 
-    with open_any(path, _options(None, None, "auto", None)) as recording, Bar(out.name, "message") as bar:
+    with open_any(path, _options(None, None, "auto", None, msg, distro)) as recording, Bar(out.name, "message") as bar:
         try:
             done = write(recording, out, on_progress=lambda done, total: bar(Progress(done, total, 0)))
         except KeyboardInterrupt:
             print(f"interrupted: {out} holds what was written so far", file=sys.stderr)
             raise
-    losses = _loss_values(done.topics, done.losses)
+    report = loss_report.values(done.good, done.losses)
     skipped = [{"topic": topic, "count": n, "reason": why} for (topic, why), n in done.skipped.items()]
     if as_json:
-        print_json({"path": str(out), **losses, "damage": list(done.damage), "not_written": skipped})
+        print_json({"path": str(out), **report, "damage": list(done.damage), "not_written": skipped})
     else:
-        print(f"{out}: {sum(tally.recovered for tally in done.topics.values())} messages of {shown(str(path))}")
-        _print_losses(losses)
+        print(f"{out}: {sum(good.count for good in done.good.values())} messages of {shown(str(path))}")
+        _print_losses(report)
         print_list("not written", [f"{one['topic']}: {one['count']} messages: {one['reason']}" for one in skipped])
         print_list("damage", done.damage)
     if not done.clean:
         raise typer.Exit(IN_PART)
 
 
-def _loss_values(topics: Mapping[str, Tally], losses: Iterable[Loss]) -> dict[str, Any]:
-    """The report of loss as plain values: by topic the counts and the last good time, and each piece of damage."""
-    return {
-        "topics": [
-            {
-                "name": name,
-                "recovered": tally.recovered,
-                "lost": tally.lost,
-                "withheld": tally.withheld,
-                "undecodable": tally.undecodable,
-            }
-            for name, tally in sorted(topics.items())
-        ],
-        "losses": [
-            {
-                "what": str(loss.what),
-                "text": loss.text,
-                "bytes": None if loss.start < 0 else [loss.start, loss.stop],
-                "first_ns": None if loss.first_ns < 0 else loss.first_ns,
-                "last_ns": None if loss.last_ns < 0 else loss.last_ns,
-            }
-            for loss in losses
-        ],
-    }
-
-
-def _print_losses(values: Mapping[str, Any]) -> None:
+def _print_losses(report: Mapping[str, Any]) -> None:
     """Print by topic what was read and what is known to be lost."""
-    heads = ("topic", "recovered", "lost", "withheld", "undecodable")
-    rows = [tuple(str(topic[key]) for key in ("name", *heads[1:])) for topic in values["topics"]]
-    if rows:
-        print("\n" + "\n".join(table(heads, rows, right=(1, 2, 3, 4))))
+    from workbench import loss_report
+
+    if found := loss_report.rows(report):
+        print("\n" + "\n".join(table(loss_report.HEADS, found, right=range(1, 7))))
 
 
 # --------------------------------------------------------------------------------- replay
@@ -373,6 +370,8 @@ def replay(
     times: TimesFile = None,
     times_unit: TimesUnit = "auto",
     tf: TimeFrames = None,
+    msg: MsgFolder = None,
+    distro: Distribution = "",
     as_json: AsJson = False,
 ) -> None:
     """Replay a recording through an estimator; write all it computed, and a summary.
@@ -402,7 +401,7 @@ def replay(
         reference=reference,
         reference_offset_s=reference_offset,
         height=height,
-        options=_options(rate, times, times_unit, tf),
+        options=_options(rate, times, times_unit, tf, msg, distro),
         calibrate=calibrate,
         smooth=smooth,
         raw_images=_one_of(raw_images, ("png", "raw"), "--raw-images"),
@@ -894,11 +893,20 @@ def settings(
 # -------------------------------------------------------------------------------- helpers
 
 
-def _options(rate: float | None, times: Path | None, unit: str, frames: Sequence[str] | None) -> ReadOptions:
+def _options(
+    rate: float | None,
+    times: Path | None,
+    unit: str,
+    frames: Sequence[str] | None,
+    msg: Path | None = None,
+    distribution: str = "",
+) -> ReadOptions:
     from readers.streams import ReadOptions, StreamError
 
     if rate is not None and not 0 < rate < float("inf"):
         raise StreamError(f"--rate {rate:g}: a frame rate is a positive number of frames per second")
+    if msg is not None and not msg.is_dir():
+        raise StreamError(f"--msg {msg}: there is no such folder; give one of .msg files")
     pairs = []
     for text in frames or ():
         parent, comma, child = text.partition(",")
@@ -910,6 +918,8 @@ def _options(rate: float | None, times: Path | None, unit: str, frames: Sequence
         times_file=times,
         times_unit=_one_of(unit, ("auto", "s", "ms", "us", "ns"), "--times-unit"),
         pose_frames=tuple(pairs),
+        distribution=distribution,
+        msg_folder=msg,
     )
 
 

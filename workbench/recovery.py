@@ -18,8 +18,9 @@ from mcap.writer import Writer as McapWriter
 from readers.decoding import MessageError, definition_of, unpacked
 from readers.log_recording import LogRecording
 from readers.message_log import Channel, Message
-from readers.salvage import Loss, Tally, tallies
+from readers.salvage import Loss
 from readers.streams import Recording, RecordingError, StreamError
+from workbench.loss_report import Good, GoodMessages
 from workbench.writers.door import uninterrupted
 
 Progress = Callable[[int, int], None]
@@ -33,12 +34,12 @@ PROFILES = {"ros1": "ros1", "cdr": "ros2"}
 class Recovered:
     """What became of a log.
 
-    `topics` counts by topic what was written (recovered), lost, withheld and undecodable; `skipped` counts by topic and
-    reason the messages that could be read and that the new file cannot hold.
+    `good` counts by topic what was written; `skipped` by topic and reason the messages that could be read and that
+    the new file cannot hold.
     """
 
     path: Path
-    topics: Mapping[str, Tally]
+    good: Mapping[str, Good]
     skipped: Mapping[tuple[str, str], int]
     losses: tuple[Loss, ...]
     damage: tuple[str, ...]
@@ -66,6 +67,8 @@ def recover(recording: Recording, path: Path, *, on_progress: Progress | None = 
         raise StreamError(
             f"{recording.path}: {recording.format} has no messages to recover; give a bag or an MCAP file"
         )
+    if recording.path.is_dir() and path.resolve().is_relative_to(recording.path.resolve()):
+        raise RecordingError(path, "it would lie among the files of the log itself", "choose another folder")
     try:
         with path.open("xb") as file:
             copy = _Copy(recording, file)
@@ -76,13 +79,11 @@ def recover(recording: Recording, path: Path, *, on_progress: Progress | None = 
         raise RecordingError(
             path, f"it cannot be written ({error.strerror or error})", "choose another folder"
         ) from error
-    losses = recording.losses
-    counts = {channel.topic: 0 for channel in recording.channels} | copy.written
     return Recovered(
         path=path,
-        topics=tallies(counts, losses),
+        good=copy.good,
         skipped=dict(copy.skipped),
-        losses=losses,
+        losses=recording.losses,
         damage=tuple(str(damage) for damage in recording.damage),
     )
 
@@ -96,7 +97,7 @@ class _Copy:
         self._channels: dict[Channel, int] = {}
         self._schemas: dict[tuple[str, str, bytes], int] = {}
         self._known: dict[tuple[str, str, int], int] = {}
-        self.written: Counter[str] = Counter()
+        self.good = GoodMessages()
         self.skipped: Counter[tuple[str, str]] = Counter()
 
     def fill(self, on_progress: Progress | None) -> None:
@@ -107,6 +108,7 @@ class _Copy:
         try:
             for channel in self._recording.channels:
                 self._number(channel)
+                self.good.setdefault(channel.topic, Good())
             for done, message in enumerate(self._recording.messages(), start=1):
                 with uninterrupted():
                     self._put(message)
@@ -134,12 +136,12 @@ class _Copy:
             sequence=max(message.sequence, 0),
             data=bytes(data),
         )
-        self.written[channel.topic] += 1
+        self.good.add(message)
 
     def _number(self, channel: Channel) -> int:
         """The number of a channel in the new file; the parts of a split log share theirs."""
         if channel not in self._channels:
-            schema_encoding, schema = definition_of(channel)
+            schema_encoding, schema = definition_of(channel, self._recording.definitions)
             schema_key = (channel.type, schema_encoding, schema)
             if channel.type and schema_key not in self._schemas:
                 self._schemas[schema_key] = self._writer.register_schema(channel.type, schema_encoding, schema)

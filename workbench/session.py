@@ -45,7 +45,7 @@ from readers.streams import (
     StreamError,
     StreamInfo,
 )
-from workbench import inputs, range_inputs
+from workbench import inputs, loss_report, range_inputs
 from workbench.range_account import RangeAccount
 from workbench.range_smoothing import Smoothing
 from workbench.settings import Plugin, Resolved, SettingsError, plugin, resolve, settings_values, to_toml
@@ -428,8 +428,8 @@ class _Audited(Recording):
         return [f"{fact.stream}: {fact.sentence}" for audit in self.audits.values() for fact in audit.facts()]
 
     def damage_lines(self) -> list[str]:
-        """What of the file was found damaged so far."""
-        return [str(damage) for damage in self._inner.damage]
+        """What of the file was found damaged so far, and what is known to be lost by topic."""
+        return [*(str(damage) for damage in self._inner.damage), *loss_report.sentences(self._inner.losses)]
 
 
 class Account(Protocol):
