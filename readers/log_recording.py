@@ -285,9 +285,14 @@ class LogRecording(Recording):
         """The channels of all files."""
         return tuple(channel for log in self._logs for channel in log.channels)
 
-    def messages(self) -> Iterator[Message]:
-        """All messages that can be read, as they are stored, in the order of their log times."""
-        return self._messages(self.channels)
+    def messages(
+        self, channels: Collection[Channel] | None = None, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[Message]:
+        """The messages of `channels` (all if None) as they are stored, in the order of their log times.
+
+        Those with ``start_ns <= log time < stop_ns``, as far as they can be read.
+        """
+        return self._messages(self.channels if channels is None else channels, start_ns, stop_ns)
 
     # ------------------------------------------------------------------------------ cameras
 

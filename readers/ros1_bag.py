@@ -38,8 +38,10 @@ _CHUNK_MARK = b"\x04\0\0\0op=\x05"
 _MESSAGE_MARK = b"\x04\0\0\0op=\x02"
 _LONGEST_CHUNK_HEADER = 80
 _LONGEST_HEADER = 1 << 20
+KEPT_BYTES = 8 << 20
 _COMPRESSIONS = (b"none", b"bz2", b"lz4")
 _END_OF_TIME = 1 << 63
+_SECOND_NS = np.uint64(1_000_000_000)
 _ENTRY = np.dtype([("seconds", "<u4"), ("rest", "<u4"), ("place", "<u4")])
 Fields = dict[bytes, bytes]
 
@@ -208,7 +210,7 @@ def _any_record(data: memoryview, at: int) -> tuple[Item, int]:
 
 
 class Span(NamedTuple):
-    """Messages of one connection in a chunk: how many, their first and last log time, and the sum of all times."""
+    """Messages of one connection in a chunk: how many, first and last log time, and the sum of all times mod 2^64."""
 
     messages: int
     first_ns: int
@@ -216,10 +218,9 @@ class Span(NamedTuple):
     sum_ns: int
 
     @classmethod
-    def of(cls, times_ns: NDArray[np.int64]) -> Span:
+    def of(cls, times_ns: NDArray[np.uint64]) -> Span:
         """The span of at least one log time."""
-        from_first = int((times_ns - times_ns[0]).sum()) + int(times_ns[0]) * len(times_ns)
-        return cls(len(times_ns), int(times_ns.min()), int(times_ns.max()), from_first)
+        return cls(len(times_ns), int(times_ns.min()), int(times_ns.max()), int(times_ns.sum()))
 
 
 @dataclass(eq=False, slots=True)
@@ -228,6 +229,11 @@ class Chunk:
 
     record: Record
     spans: dict[int, Span]
+
+    @property
+    def packed(self) -> bool:
+        """Whether it is compressed."""
+        return self.record.fields[b"compression"] != b"none"
 
     @property
     def first_ns(self) -> int:
@@ -241,8 +247,8 @@ class Chunk:
 
     @property
     def sum_ns(self) -> int:
-        """Sum of all its log times."""
-        return sum(span.sum_ns for span in self.spans.values())
+        """Sum of all its log times mod 2^64."""
+        return sum(span.sum_ns for span in self.spans.values()) % 2**64
 
 
 class ChunkIndex(NamedTuple):
@@ -251,7 +257,7 @@ class ChunkIndex(NamedTuple):
     `complete` where another record follows it.
     """
 
-    times_ns: dict[int, NDArray[np.int64]]
+    times_ns: dict[int, NDArray[np.uint64]]
     places: list[int]
     complete: bool
 
@@ -263,7 +269,7 @@ class ChunkIndex(NamedTuple):
 
 def index_behind(data: memoryview, chunk: Record) -> ChunkIndex:
     """The index records behind a chunk, as far as they are whole."""
-    times: dict[int, NDArray[np.int64]] = {}
+    times: dict[int, NDArray[np.uint64]] = {}
     places: list[int] = []
     at, complete = chunk.stop, False
     try:
@@ -273,7 +279,7 @@ def index_behind(data: memoryview, chunk: Record) -> ChunkIndex:
             if record.operation != _INDEX or record.stop > len(data):
                 break
             entries = np.frombuffer(data[record.start : record.stop], _ENTRY)
-            found = entries["seconds"].astype(np.int64) * 1_000_000_000 + entries["rest"]
+            found = entries["seconds"] * _SECOND_NS + entries["rest"]
             number = record.u32(b"conn")
             times[number] = np.concatenate([times[number], found]) if number in times else found
             places += entries["place"].tolist()
@@ -313,6 +319,7 @@ class Ros1Log(MessageLog):
         self._by_id: dict[int, Channel] = {}
         self._chunks: list[Chunk] = []
         self._latest: tuple[Chunk | None, list[Message]] = (None, [])
+        self._kept: dict[Chunk, Buffer] = {}
         self._told: set[tuple[str, int]] = set()
         self._aheads: WeakSet[Ahead[Chunk, Buffer]] = WeakSet()
         if self._data[: len(MAGIC)] != MAGIC:
@@ -498,7 +505,7 @@ class Ros1Log(MessageLog):
                 numbers = {channel: number for number, channel in self._by_id.items()}
                 number = numbers[message.channel]
             times.setdefault(number, []).append(message.log_ns)
-        return {number: Span.of(np.array(found)) for number, found in times.items()}
+        return {number: Span.of(np.array(found, np.uint64)) for number, found in times.items()}
 
     def _tallies(self, counts: Mapping[int, int], *, withheld: bool = False) -> dict[str, Tally]:
         found: dict[str, Tally] = {}
@@ -512,21 +519,27 @@ class Ros1Log(MessageLog):
     # ------------------------------------------------------------------------------- messages
 
     def _unpacked(self, chunk: Chunk) -> Buffer:
-        """The records of a chunk.
+        """The records of a chunk; the latest few that were packed are kept, for a second look at the log's begin.
 
         Raises:
             DamagedBlockError: they cannot be unpacked.
         """
+        if (kept := self._kept.get(chunk)) is not None:
+            return kept
         record = chunk.record
         packed = self._data[record.start : record.stop]
-        compression = text(record.fields[b"compression"])
-        return inflate(compression, packed, record.u32(b"size"), torn=record.torn)
+        data = inflate(text(record.fields[b"compression"]), packed, record.u32(b"size"), torn=record.torn)
+        if chunk.packed and len(data) <= KEPT_BYTES // 8:
+            while len(self._kept) >= 8:
+                self._kept.pop(next(iter(self._kept)), None)
+            self._kept[chunk] = data
+        return data
 
     def _load(self, chunk: Chunk, ahead: Ahead[Chunk, Buffer] | None = None) -> list[Message]:
         """The messages of a chunk in the order of log time; what is wrong with it is noted."""
         if self._latest[0] is not chunk:
             try:
-                data = self._unpacked(chunk) if ahead is None else ahead.take(chunk)
+                data = ahead.take(chunk) if ahead is not None and chunk.packed else self._unpacked(chunk)
                 found = self._messages(chunk, memoryview(data))
             except DamagedBlockError as error:
                 found = []
@@ -579,7 +592,7 @@ class Ros1Log(MessageLog):
         stated = {number: span.messages for number, span in chunk.spans.items()}
         missing = {number: count - counts[number] for number, count in stated.items() if count > counts[number]}
         strangers = {number: count for number, count in counts.items() if number not in self._by_id}
-        moved = bool(stated) and all(span.sum_ns for span in chunk.spans.values()) and sum_ns != chunk.sum_ns
+        moved = bool(stated) and all(span.sum_ns for span in chunk.spans.values()) and sum_ns % 2**64 != chunk.sum_ns
         surplus = sum(count - stated.get(number, 0) for number, count in counts.items() if stated) > 0
         times = [time for span in chunk.spans.values() for time in (span.first_ns, span.last_ns) if time >= 0]
         known: dict[str, Any] = {"first_ns": min(times), "last_ns": max(times)} if times else {}
@@ -611,7 +624,7 @@ class Ros1Log(MessageLog):
                 for span in spans
             ):
                 chosen.append(chunk)
-        ahead = Ahead(self._unpacked, [(chunk, chunk.record.u32(b"size")) for chunk in chosen])
+        ahead = Ahead(self._unpacked, [(c, c.record.u32(b"size")) for c in chosen if c.packed])
         self._aheads.add(ahead)
         low, high = start_ns or 0, stop_ns if stop_ns is not None else _END_OF_TIME
         for chunk in chosen:
@@ -646,6 +659,7 @@ class Ros1Log(MessageLog):
         for ahead in list(self._aheads):
             ahead.stop()
         self._latest = (None, [])
+        self._kept.clear()
         self._chunks = []
 
 

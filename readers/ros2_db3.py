@@ -84,7 +84,7 @@ class SqliteLog(MessageLog):
         return sqlite3.connect(self._readable, check_same_thread=False)
 
     _COUNT = (
-        "SELECT topic_id, typeof(timestamp) = 'integer', typeof(data) = 'null', count(*),"
+        "SELECT topic_id, typeof(timestamp) = 'integer', data IS NULL, count(*),"
         " min(timestamp), max(timestamp) FROM messages GROUP BY 1, 2, 3"
     )
 
