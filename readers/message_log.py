@@ -323,7 +323,6 @@ class _Codecs(threading.local):
 
     def __init__(self) -> None:
         self.zstd = zstandard.ZstdDecompressor()
-        self.lz4 = lz4.frame.LZ4FrameDecompressor()
 
 
 _codecs = _Codecs()
@@ -362,11 +361,11 @@ def _unpack(compression: str, data: Buffer, size: int, limit: int, torn: bool) -
     if compression == "bz2":
         return bz2.BZ2Decompressor().decompress(data, min(size, limit) + 1)
     if compression == "lz4":
-        _codecs.lz4.reset()
-        found: bytes = _codecs.lz4.decompress(data, max_length=min(size, limit) + 1)
-        if not _codecs.lz4.eof and len(found) <= limit and not torn:
-            found += _codecs.lz4.decompress(b"", max_length=limit + 1 - len(found))
-            if not _codecs.lz4.eof and len(found) <= limit:
+        unpacker = lz4.frame.LZ4FrameDecompressor()  # one that met damage goes on to refuse sound data
+        found: bytes = unpacker.decompress(data, max_length=min(size, limit))  # one byte more is ten times as slow
+        if not unpacker.eof and len(found) <= limit and not torn:
+            found += unpacker.decompress(b"", max_length=1)
+            if not unpacker.eof and len(found) <= min(size, limit):
                 raise EOFError("its end is missing")
         return found
     stated = zstandard.frame_content_size(data) if not torn else -1
