@@ -10,15 +10,17 @@ import itertools
 import statistics
 from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass, field
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
+from typing import Any
 
 import numpy as np
 
 from readers.clock import REORDER_WINDOW_NS, SECOND_NS, merge, reorder, sane_stamp
 from readers.decoding import Decoder, Definitions, MessageError, decoder_of, definition_text
-from readers.message_log import Channel, Message, MessageLog, Source, in_log_order
+from readers.fixed_layout import FixedReader, fixed_reader, header_of
+from readers.message_log import Buffer, Channel, Message, MessageLog, Source, in_log_order
 from readers.messages import (
     Arrival,
     OtherUseError,
@@ -67,6 +69,7 @@ class Topic:
     trust_stamps: bool = True
     pairs: tuple[StreamInfo, ...] = ()
     decoders: dict[Channel, Decoder] = field(default_factory=dict)
+    fixed: dict[Channel, FixedReader] = field(default_factory=dict)
 
     @property
     def streams(self) -> tuple[StreamInfo, ...]:
@@ -96,8 +99,13 @@ class Topic:
         """The samples of one message; a `Problem` if it cannot be made into any."""
         assert self.reader is not None
         try:
+            arrival = Arrival(self.name, message.log_ns, self.trust_stamps)
+            fixed = self.fixed.get(message.channel)
+            if fixed is not None and (sample := fixed(message.data, arrival)) is not None:
+                yield sample
+                return
             decoded = self.decoders[message.channel](message.data)
-            yield from samples_of(self.reader, decoded, Arrival(self.name, message.log_ns, self.trust_stamps))
+            yield from samples_of(self.reader, decoded, arrival)
         except MessageError as error:
             stream = self.pairs[0].name if self.pairs else self.name
             yield Problem(
@@ -167,6 +175,11 @@ class LogRecording(Recording):
             if topic.reader is None:
                 topic.reason = f"no reader for type {type_name}" if type_name else "the file has no schema for it"
             for channel in channels:
+                fixed = fixed_reader(channel)
+                if fixed is not None:
+                    topic.fixed[channel] = fixed
+                    topic.decoders[channel] = partial(_decode_late, channel)
+                    continue
                 known = topic.reader or channel.encoding not in ("ros1", "cdr")
                 decoder = decoder_of(channel, self.definitions) if known else None
                 if decoder is not None and topic.reader is not None:
@@ -184,6 +197,10 @@ class LogRecording(Recording):
         stamps: list[tuple[int, int]] = []
         for message in itertools.islice(self._messages(topic.channels), FIRST_MESSAGES):
             try:
+                if message.channel in topic.fixed and (found := header_of(message.data)) is not None:
+                    topic.frame = topic.frame or found[1]
+                    stamps.append((message.log_ns, found[0]))
+                    continue
                 decoded = topic.decoders[message.channel](message.data)
                 list(samples_of(topic.reader, decoded, Arrival(topic.name, message.log_ns)))
                 topic.frame = topic.frame or frame_of(decoded)
@@ -411,6 +428,11 @@ class LogRecording(Recording):
             log.close()
         if self._scratch is not None:
             self._scratch.cleanup()
+
+
+def _decode_late(channel: Channel, data: Buffer) -> Any:
+    """Decode a message of a channel whose decoder is seldom needed; it is made with the first."""
+    return decoder_of(channel)(data)
 
 
 def _camera_topic(image: Topic, infos: list[Topic]) -> Topic | None:

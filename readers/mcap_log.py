@@ -7,10 +7,9 @@ Chunks are unpacked one at a time, ahead of the reading, and always compared wit
 from __future__ import annotations
 
 import mmap
-from collections import Counter, OrderedDict
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections import OrderedDict
+from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass, field, replace
 from pathlib import Path
 from types import MappingProxyType
 
@@ -24,6 +23,7 @@ from readers.mcap_records import (
     MAGIC,
     ChannelRecord,
     ChunkIndex,
+    McapBlock,
     Opcode,
     RecordError,
     Segment,
@@ -40,6 +40,7 @@ from readers.mcap_records import (
     unpack_chunk,
     walk,
 )
+from readers.mcap_scan import Scan
 from readers.message_log import Block, Channel, IndexedLog, Message, Source, crc32
 from readers.salvage import Cause, Loss, Tally
 from readers.streams import RecordingError
@@ -47,30 +48,9 @@ from readers.streams import RecordingError
 READ_AHEAD = 2
 KEPT_BLOCKS = 4
 KEPT_BYTES = 1 << 24
+SHORT_READ = 8  # blocks; for so few no thread is started
 WORTH_A_THREAD_BYTES = 1 << 16
 _DEFAULT_ENCODING = {"ros1": "ros1", "ros2": "cdr"}
-
-
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
-class McapBlock(Block):
-    """A chunk, or a run of messages outside of chunks.
-
-    `stated` is what the chunk index says of it, `indexes` the offsets of its message indexes by channel.
-    """
-
-    segment: Segment
-    chunk: bool = True
-    stated: Stated | None = None
-    indexes: Mapping[Channel, int] = field(default_factory=dict)
-
-    def of(self, first_ns: int, last_ns: int, counts: Mapping[Channel, int]) -> McapBlock:
-        """The same block, whose content is known."""
-        return replace(self, first_ns=first_ns, last_ns=last_ns, counts=counts)
-
-    @property
-    def memory_bytes(self) -> int:
-        """How much memory it takes to unpack it; none where it lies in the file as it is."""
-        return self.stated.unpacked_bytes if self.stated is not None and self.stated.compression else 0
 
 
 class McapLog(IndexedLog):
@@ -82,12 +62,15 @@ class McapLog(IndexedLog):
 
     def __init__(self, path: Path) -> None:
         super().__init__(path, "MCAP")
+        if not path.stat().st_size:
+            raise RecordingError(path, "the file is empty (0 bytes)", "record or copy it again")
         with path.open("rb") as file:
             self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self.view = memoryview(self._map)
         self.statistics: Statistics | None = None
         self._unpacked: OrderedDict[int, Future[Unpacked]] = OrderedDict()
         self._checked: set[int] = set()
+        self.told: set[int] = set()
         self._thread: ThreadPoolExecutor | None = None
         try:
             self._open()
@@ -96,8 +79,6 @@ class McapLog(IndexedLog):
             raise
 
     def _open(self) -> None:
-        from readers.mcap_scan import Scan
-
         if self.view[: len(MAGIC)] != MAGIC:
             raise RecordingError(self.path, "it does not begin like an MCAP file", "check that the file is complete")
         segment = Segment(profile=self.profile(0))
@@ -179,6 +160,8 @@ class McapLog(IndexedLog):
             return False
         if not all(set(index.indexes) <= set(segment.channels) for index in indexes):
             return False
+        if any(record.schema and record.schema not in segment.schemas for record in segment.records.values()):
+            return False
         self._blocks = [self._block(segment, index, start) for index in indexes]
         return self._agrees(segment, self.statistics)
 
@@ -213,43 +196,55 @@ class McapLog(IndexedLog):
 
     def _agrees(self, segment: Segment, statistics: Statistics) -> bool:
         """Whether the indexes and the statistics count the same messages; keeps the counts."""
-        total: Counter[Channel] = Counter()
+        total: dict[Channel, int] = {}
         for block in self._blocks:
-            total.update(block.counts)
+            for channel, count in block.counts.items():
+                total[channel] = total.get(channel, 0) + count
         stated = {segment.channels.get(number): count for number, count in statistics.counts.items() if count}
-        if dict(+total) != stated or sum(total.values()) != statistics.messages:
+        if {channel: count for channel, count in total.items() if count} != stated or sum(
+            total.values()
+        ) != statistics.messages:
             return False
         for channel, count in total.items():
             channel.count = count
         return True
 
-    def describe(self, segment: Segment, opcode: int, body: memoryview) -> bool:
-        """Take a schema or a channel; other records are passed over. False where it contradicts an earlier one.
+    def describe(self, segment: Segment, opcode: int, body: memoryview, *, sure: bool = False) -> bool:
+        """Take a schema or a channel; other records are passed over.
+
+        Returns:
+            False where it contradicts an earlier one, which it replaces if it is `sure`, guarded by a checksum.
 
         Raises:
             RecordError: it cannot be parsed.
         """
         if opcode == Opcode.SCHEMA:
             number, schema = read_schema(body)
-            return segment.schemas.setdefault(number, schema) == schema
+            agrees = segment.schemas.get(number, schema) == schema
+            if number not in segment.schemas or (sure and not agrees):
+                segment.schemas[number] = schema
+                for other, record in segment.records.items():
+                    if record.schema == number:
+                        self._describe_channel(segment, other, record)
+            return agrees
         if opcode == Opcode.CHANNEL:
             number, record = read_channel(body)
-            if number in segment.channels:
-                return segment.records[number] == record
-            self._add_channel(segment, number, record)
+            agrees = segment.records.get(number, record) == record
+            if number not in segment.records or (sure and not agrees):
+                self._describe_channel(segment, number, record)
+            return agrees
         return True
 
-    def _add_channel(self, segment: Segment, number: int, record: ChannelRecord) -> None:
-        schema = segment.schemas.get(record.schema)
-        channel = Channel(
-            topic=record.topic,
-            type=schema.name if schema else "",
-            encoding=record.encoding or _DEFAULT_ENCODING.get(segment.profile, ""),
-            schema_encoding=schema.encoding if schema else "",
-            schema=schema.data if schema else b"",
-        )
-        segment.channels[number], segment.records[number] = channel, record
-        self.channels.append(channel)
+    def _describe_channel(self, segment: Segment, number: int, record: ChannelRecord) -> None:
+        if number not in segment.channels:
+            segment.channels[number] = Channel("", "", "")
+            self.channels.append(segment.channels[number])
+        segment.records[number] = record
+        channel, schema = segment.channels[number], segment.schemas.get(record.schema)
+        channel.topic = record.topic
+        channel.encoding = record.encoding or _DEFAULT_ENCODING.get(segment.profile, "")
+        if schema is not None:
+            channel.type, channel.schema_encoding, channel.schema = schema
 
     def _find_edges(self) -> None:
         """Fill in the first and last log time of every channel, from the message indexes that can hold them."""
@@ -326,7 +321,7 @@ class McapLog(IndexedLog):
             future.set_result(self.unpack(block))
             self._unpacked[block.offset] = future
         for following in ahead if block.memory_bytes * KEPT_BLOCKS <= KEPT_BYTES else ():
-            if following.offset not in self._unpacked and following.size >= WORTH_A_THREAD_BYTES:
+            if following.offset not in self._unpacked and following.memory_bytes >= WORTH_A_THREAD_BYTES:
                 self._thread = self._thread or ThreadPoolExecutor(1, "unpack")
                 self._unpacked[following.offset] = self._thread.submit(self.unpack, following)
         self._unpacked.move_to_end(block.offset)
@@ -334,15 +329,10 @@ class McapLog(IndexedLog):
         kept = KEPT_BLOCKS if block.memory_bytes * KEPT_BLOCKS <= KEPT_BYTES else 1
         while len(self._unpacked) > kept:
             self._unpacked.popitem(last=False)
-        if unpacked.faults:
+        if unpacked.faults and block.offset not in self.told:
+            self.told.add(block.offset)
             self._report_block(block, unpacked)
         return unpacked
-
-    def messages_of(self, block: McapBlock, channels: Collection[Channel] | None = None) -> Walked:
-        """The messages of the channels (all if None) in one block, in the order of the file."""
-        numbered = block.segment.channels
-        wanted = {n: c for n, c in numbered.items() if c in channels} if channels is not None else numbered
-        return walk(self._load(block).records, block.segment, wanted)
 
     def _select(
         self, block: Block, channels: Collection[Channel], start_ns: int | None, stop_ns: int | None
@@ -364,9 +354,9 @@ class McapLog(IndexedLog):
         wanted = {number: channel for number, channel in block.segment.channels.items() if channel in channels}
         walked = walk(unpacked.records, block.segment, wanted)
         messages = walked.messages
-        self._compare(block, walked, sum(block.counts.get(channel, 0) for channel in wanted.values()))
         if not walked.ordered:
             messages.sort(key=lambda message: message.log_ns)
+        self._compare(block, walked, sum(block.counts.get(channel, 0) for channel in wanted.values()))
         if start_ns is not None and block.first_ns < start_ns:
             messages = [message for message in messages if message.log_ns >= start_ns]
         if stop_ns is not None and block.last_ns >= stop_ns:
@@ -397,7 +387,7 @@ class McapLog(IndexedLog):
             and not wanted.isdisjoint(block.counts)
         ]
         for place, block in enumerate(blocks):
-            ahead = blocks[place + 1 : place + 1 + READ_AHEAD] if place else ()
+            ahead = blocks[place + 1 : place + 1 + READ_AHEAD] if place >= SHORT_READ else ()
 
             def open_it(block: McapBlock = block, ahead: Collection[McapBlock] = ahead) -> Iterator[Message]:
                 return self._chosen(block, ahead, wanted, start_ns, stop_ns)
@@ -407,6 +397,17 @@ class McapLog(IndexedLog):
     def add_block(self, block: McapBlock) -> None:
         """Take a block that a scan found."""
         self._blocks.append(block)
+
+    def withhold(self, blocks: Collection[McapBlock]) -> None:
+        """Take back messages that a scan found where none should be."""
+        for block in blocks:
+            self._blocks.remove(block)
+            for channel, count in block.counts.items():
+                channel.count -= count
+            counts = {channel.topic: Tally(withheld=count) for channel, count in block.counts.items()}
+            text = f"{sum(block.counts.values())} messages outside of chunks, where the others are, are left out"
+            span = (block.offset, block.offset + block.size)
+            self.report(Cause.CHECKSUM, text, *span, counts, (block.first_ns, block.last_ns))
 
     def close(self) -> None:
         """Release the file; images that are still held keep their part of it."""

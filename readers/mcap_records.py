@@ -9,13 +9,13 @@ import enum
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from readers.message_log import Channel, DamagedBlockError, Message, crc32, inflate, text
+from readers.message_log import Block, Channel, DamagedBlockError, Message, crc32, inflate, name, text
 from readers.salvage import Cause
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -31,6 +31,7 @@ _COUNT = struct.Struct("<HQ")
 _OFFSET = struct.Struct("<HQ")
 _INDEX = struct.Struct("<HI")
 _STATISTICS = struct.Struct("<QHIIIIQQ")
+_TWO_U16 = struct.Struct("<HH")
 _U16, _U32, _U64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 INDEX_ENTRY = np.dtype([("log_ns", "<u8"), ("offset", "<u8")])
 
@@ -81,8 +82,8 @@ class RecordError(ValueError):
 
 
 def known(opcode: int, length: int) -> bool:
-    """Whether a record of that kind can have that length."""
-    return opcode >= PRIVATE or length >= SHORTEST.get(opcode, 1 << 64)  # type: ignore[call-overload]
+    """Whether a record of that kind can have that length; False for kinds that the format does not define."""
+    return opcode in SHORTEST and length >= SHORTEST[Opcode(opcode)]
 
 
 # ---------------------------------------------------------------------------------- bodies
@@ -109,7 +110,7 @@ def _unpack(layout: struct.Struct, body: memoryview, at: int = 0) -> tuple[int, 
 
 def read_profile(body: memoryview) -> str:
     """The profile that a header record names."""
-    return text(_sized(body, 0)[0])
+    return name(_sized(body, 0)[0])
 
 
 class Schema(NamedTuple):
@@ -123,10 +124,10 @@ class Schema(NamedTuple):
 def read_schema(body: memoryview) -> tuple[int, Schema]:
     """Number and content of a schema record."""
     (number,) = _unpack(_U16, body)
-    name, at = _sized(body, 2)
+    title, at = _sized(body, 2)
     encoding, at = _sized(body, at)
     data, _ = _sized(body, at)
-    return number, Schema(text(name), text(encoding), bytes(data))
+    return number, Schema(name(title), name(encoding), bytes(data))
 
 
 class ChannelRecord(NamedTuple):
@@ -139,11 +140,11 @@ class ChannelRecord(NamedTuple):
 
 def read_channel(body: memoryview) -> tuple[int, ChannelRecord]:
     """Number and content of a channel record; its metadata are not read."""
-    number, schema = _unpack(struct.Struct("<HH"), body)
+    number, schema = _unpack(_TWO_U16, body)
     topic, at = _sized(body, 4)
     encoding, at = _sized(body, at)
     _sized(body, at)
-    return number, ChannelRecord(schema, text(topic), text(encoding))
+    return number, ChannelRecord(schema, name(topic), name(encoding))
 
 
 class ChunkIndex(NamedTuple):
@@ -224,9 +225,9 @@ class ChunkHead(NamedTuple):
 def read_chunk_head(body: memoryview) -> ChunkHead:
     """The fields of a chunk record before its packed records."""
     _, _, size, crc = _unpack(_CHUNK, body)
-    name, at = _sized(body, _CHUNK.size)
+    compression, at = _sized(body, _CHUNK.size)
     (packed,) = _unpack(_U64, body, at)
-    return ChunkHead(size, crc, text(name), at + 8, at + 8 + packed)
+    return ChunkHead(size, crc, text(compression), at + 8, at + 8 + packed)
 
 
 @dataclass(frozen=True, slots=True)
@@ -296,6 +297,28 @@ class Segment:
     schemas: dict[int, Schema] = field(default_factory=dict)
     records: dict[int, ChannelRecord] = field(default_factory=dict)
     channels: dict[int, Channel] = field(default_factory=dict)
+
+
+@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+class McapBlock(Block):
+    """A chunk, or a run of messages outside of chunks.
+
+    `stated` is what the chunk index says of it, `indexes` the offsets of its message indexes by channel.
+    """
+
+    segment: Segment
+    chunk: bool = True
+    stated: Stated | None = None
+    indexes: Mapping[Channel, int] = field(default_factory=dict)
+
+    def of(self, first_ns: int, last_ns: int, counts: Mapping[Channel, int]) -> McapBlock:
+        """The same block, whose content is known."""
+        return replace(self, first_ns=first_ns, last_ns=last_ns, counts=counts)
+
+    @property
+    def memory_bytes(self) -> int:
+        """How much memory it takes to unpack it; none where it lies in the file as it is."""
+        return self.stated.unpacked_bytes if self.stated is not None and self.stated.compression else 0
 
 
 @dataclass(slots=True)

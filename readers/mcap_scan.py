@@ -15,7 +15,9 @@ from readers.mcap_records import (
     FOOTER,
     HEAD,
     MAGIC,
+    PRIVATE,
     SHORTEST,
+    McapBlock,
     Opcode,
     RecordError,
     Segment,
@@ -31,11 +33,13 @@ from readers.message_log import Channel, crc32
 from readers.salvage import Cause, Tally
 
 if TYPE_CHECKING:
-    from readers.mcap_log import McapBlock, McapLog
+    from readers.mcap_log import McapLog
 
 RUN_BYTES = 1 << 20
 WINDOW_BYTES = 1 << 22
 CHAIN = 3
+ZEROS_BYTES = 512
+UNDEFINED = range(0x10, 0x100)
 _PLAUSIBLE = np.zeros(256, bool)
 _PLAUSIBLE[[*SHORTEST]] = True
 _UNREADABLE = "bytes that are no records were passed over"
@@ -57,16 +61,20 @@ class Scan:
         self.closed = False
         self.unchecked = 0
         self.cost: Counter[Channel] = Counter()
+        self.loose: list[McapBlock] = []
+        self.chunked = False
+        self.losses = len(log.losses)
+        self.magic = 0  # where the next file that was joined may begin, -1 if none does
 
     def run(self) -> None:
         """Walk from the first record to the end of the file."""
         self.log.notes.append("The file has no usable index; it was read once to list what it holds.")
-        losses = len(self.log.losses)
         at = len(MAGIC)
         while at < self.size:
             at = self._step(at)
         self._end_run(self.size)
-        self._report_end(len(self.log.losses) > losses)
+        self._end_segment()
+        self._report_end()
 
     # ------------------------------------------------------------------------------- steps
 
@@ -85,6 +93,9 @@ class Scan:
             return self._chunk(at, end)
         if opcode and self._leads_on(end) and self._take(at, opcode, end):
             return end
+        if not opcode and self.view[at] in UNDEFINED and end <= self.size and self._leads_on(end):
+            self._undefined(at, end)
+            return end
         return self._passed_over(at)
 
     def _head(self, at: int) -> tuple[int, int]:
@@ -100,7 +111,13 @@ class Scan:
             return at == self.size
         if at + HEAD.size > self.size:
             return self.view[at] in SHORTEST or self.view[at] == MAGIC[0]
-        return bool(self._head(at)[0]) or self.view[at : at + len(MAGIC)] == MAGIC
+        if self.view[at] == 0:  # a power loss leaves zeros
+            zeros = self.view[at : at + ZEROS_BYTES]
+            return zeros == bytes(len(zeros))
+        opcode, end = self._head(at)
+        if not opcode and self.view[at] in UNDEFINED:
+            return end <= self.size and (end == self.size or bool(self._head(end)[0]))
+        return bool(opcode) or self.view[at : at + len(MAGIC)] == MAGIC
 
     def _take(self, at: int, opcode: int, end: int) -> bool:
         """Take a record that is neither message nor chunk; False if it cannot be what it says."""
@@ -111,13 +128,24 @@ class Scan:
                     self.log.report(Cause.SCHEMA, "a schema or channel is described in two ways", at, at)
             elif opcode == Opcode.MESSAGE_INDEX:
                 read_message_index(body)
+                self.chunked = True
             elif opcode == Opcode.DATA_END:
                 self._data_end(at, body)
-            elif opcode not in SHORTEST and not self.closed:
-                self.log.report(Cause.CODEC, f"a record of the unknown kind {opcode:#x} was passed over", at, end)
         except RecordError:
             return False
         return True
+
+    def _undefined(self, at: int, end: int) -> None:
+        """A record of an undefined kind, which may be a defined one with a damaged first byte."""
+        try:
+            chunk = read_chunk_head(self.view[at + HEAD.size : end]).stop == end - at - HEAD.size
+        except RecordError:
+            chunk = False
+        kind = self.view[at]
+        if kind < PRIVATE or chunk:
+            self.log.report(Cause.CODEC, f"a record of the unknown kind {kind:#x} was passed over", at, end)
+        else:
+            self.log.notes.append(f"A record of the private kind {kind:#x} was passed over.")
 
     def _data_end(self, at: int, body: memoryview) -> None:
         """Compare the whole data section with its checksum where messages have none of their own."""
@@ -150,6 +178,7 @@ class Scan:
     def _joined(self, at: int) -> int:
         """Begin with another file that was joined to this one."""
         self.log.report(Cause.ORDER, "another log begins; the two were joined and both are read", at, at)
+        self._end_segment()
         self.segment = Segment(start=at, profile=self.log.profile(at))
         self.closed, self.unchecked = False, 0
         return at + len(MAGIC)
@@ -168,6 +197,7 @@ class Scan:
             head = read_chunk_head(body)
         except RecordError:
             return self._passed_over(at)
+        self.chunked = True
         inner = at + HEAD.size + head.stop
         if end <= self.size and inner <= end and self._leads_on(end):
             self._block(at, end)
@@ -185,14 +215,13 @@ class Scan:
 
     def _block(self, start: int, end: int, *, chunk: bool = True, torn: bool = False) -> int:
         """Read a block once, count what it holds and give it to the log; the number of its messages."""
-        from readers.mcap_log import McapBlock
-
         stated = None
         if chunk:
             head = read_chunk_head(self.view[start + HEAD.size : end])
             stated = Stated(head.compression, head.stop - head.start, head.unpacked_bytes)
         block = McapBlock(start, end - start, 0, 0, {}, torn, segment=self.segment, chunk=chunk, stated=stated)
         unpacked = self.log.unpack(block)
+        self.log.told.add(start)
         if unpacked.withheld:
             counts, times = self._listed(end)
             self.cost.update(counts)
@@ -205,7 +234,7 @@ class Scan:
         return self._count(start, end, block, unpacked.records, checked=bool(unpacked.crc) and not torn)
 
     def _count(self, start: int, end: int, block: McapBlock, records: memoryview, *, checked: bool) -> int:
-        self._describe_inside(start, records)
+        self._describe_inside(start, records, sure=checked)
         walked = walk(records, self.segment, self.segment.channels)
         if walked.fault and not block.torn:
             self.log.report(Cause.CUT, walked.fault, start, start)
@@ -216,18 +245,21 @@ class Scan:
             message.channel.note(message.log_ns)
         if walked.messages:
             times = [message.log_ns for message in walked.messages]
-            self.log.add_block(block.of(min(times), max(times), Counter(m.channel for m in walked.messages)))
+            block = block.of(min(times), max(times), Counter(m.channel for m in walked.messages))
+            self.log.add_block(block)
+            if not block.chunk:
+                self.loose.append(block)
         if block.chunk and not checked:
             self.unchecked += len(walked.messages)
         return len(walked.messages)
 
-    def _describe_inside(self, start: int, records: memoryview) -> None:
+    def _describe_inside(self, start: int, records: memoryview, *, sure: bool) -> None:
         """Take the schemas and channels inside of a chunk; a chunk in it is refused."""
         for opcode, body in walk(records, self.segment, {}).others:
             try:
                 if opcode == Opcode.CHUNK:
                     self.log.report(Cause.CODEC, "a chunk inside of a chunk was passed over", start, start)
-                elif not self.log.describe(self.segment, opcode, body):
+                elif not self.log.describe(self.segment, opcode, body, sure=sure):
                     self.log.report(Cause.SCHEMA, "a schema or channel is described in two ways", start, start)
             except RecordError:
                 self.log.report(Cause.SCHEMA, "a schema or channel record cannot be parsed", start, start)
@@ -262,7 +294,9 @@ class Scan:
 
     def _search(self, start: int, *, chunks_only: bool = False) -> int:
         """The first place from `start` on from which several records follow each other, -1 if there is none."""
-        magic = self.log.find(MAGIC, start)
+        if 0 <= self.magic < start:
+            self.magic = self.log.find(MAGIC, start)
+        magic = self.magic
         stop = magic if 0 <= magic < self.size - len(MAGIC) else self.size
         for window in range(start, stop, WINDOW_BYTES):
             raw = np.frombuffer(self.view[window : min(window + WINDOW_BYTES + HEAD.size, stop)], np.uint8)
@@ -303,7 +337,33 @@ class Scan:
 
     # --------------------------------------------------------------------------------- end
 
-    def _report_end(self, lost: bool) -> None:
+    def _end_segment(self) -> None:
+        """Withhold messages outside of chunks where others lie in chunks with checksums and the file is damaged.
+
+        They may be the inside of a chunk whose beginning is damaged, or other records that turned into messages.
+        """
+        loose, self.loose = self.loose, []
+        damaged = len(self.log.losses) > self.losses or (self.fault and self._count_differs())
+        if loose and self.chunked and damaged:
+            self.log.withhold(loose)
+            for block in loose:
+                self.cost.update(block.counts)
+        self.chunked = False
+
+    def _count_differs(self) -> bool:
+        """Whether the file states how many messages of each channel it holds, and others were found."""
+        return self.log.statistics is not None and not self.segment.start and any(self._differences().values())
+
+    def _differences(self) -> Counter[Channel]:
+        """By channel: how many more messages the file states than were found, or withheld with a cause."""
+        statistics, channels = self.log.statistics, self.segment.channels
+        assert statistics is not None
+        more = Counter({channel: statistics.counts.get(number, 0) for number, channel in channels.items()})
+        more.subtract(self.cost)
+        more.subtract({channel: channel.count for channel in channels.values()})
+        return more
+
+    def _report_end(self) -> None:
         """Report how the file ends, and where its own counts differ from what was found."""
         if not self.closed:
             self.log.report(
@@ -311,14 +371,16 @@ class Scan:
             )
         elif self.fault:
             self.log.report(Cause.CUT, f"{self.fault}; the file was read without it", self.size, self.size)
+        for number, record in self.segment.records.items():
+            if record.schema and record.schema not in self.segment.schemas:
+                text = f"the schema {record.schema} of {self.segment.channels[number].topic[:80]!r} is missing"
+                self.log.report(Cause.SCHEMA, text, -1, -1)
         statistics = self.log.statistics
         if statistics is None or self.segment.start:
             return
-        missing = Counter({c: statistics.counts.get(n, 0) for n, c in self.segment.channels.items()})
-        missing.subtract(self.cost)
-        missing.subtract({channel: channel.count for channel in self.segment.channels.values()})
         found = sum(channel.count for channel in self.segment.channels.values()) + self.cost.total()
-        if any(missing.values()) or statistics.messages != found:
+        more = self._differences()
+        if any(more.values()) or statistics.messages != found:
             text = f"the file claims {statistics.messages} messages and {found} were found"
-            lost_counts = {c.topic: Tally(lost=count) for c, count in missing.items() if count > 0}
-            self.log.report(Cause.COUNT, text, -1, -1, lost_counts if lost else None)
+            lost = {channel.topic: Tally(lost=count) for channel, count in more.items() if count > 0}
+            self.log.report(Cause.COUNT, text, -1, -1, lost if len(self.log.losses) > self.losses else None)

@@ -9,13 +9,13 @@ from __future__ import annotations
 import abc
 import bz2
 import heapq
+import re
 import threading
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import lz4.frame  # type: ignore[import-untyped, unused-ignore]
 import zstandard
@@ -29,6 +29,7 @@ except ImportError:
     from zlib import crc32 as crc32
 
 Buffer = bytes | memoryview
+_CONTROL = re.compile(r"[\x00-\x1f\x7f-\x9f\u061c\u200e\u200f\u2028-\u202e\u2066-\u2069]")
 LARGEST_BLOCK_BYTES = 2**30
 LARGEST_UNPACKED_BYTES = 2**28
 LARGEST_RATIO = 1024
@@ -213,7 +214,7 @@ class IndexedLog(MessageLog):
             if stop_ns is not None and block.first_ns >= stop_ns:
                 continue
             if wanted & block.channels:
-                yield Source(block.first_ns, partial(self._select, block, wanted, start_ns, stop_ns), block.last_ns)
+                yield Source(block.first_ns, partial(self._select, block, wanted, start_ns, stop_ns))
 
     def count_before(self, channels: Collection[Channel], stop_ns: int) -> int:
         """How many messages of `channels` were logged before `stop_ns`, by the index for all but the last blocks.
@@ -229,93 +230,6 @@ class IndexedLog(MessageLog):
             else:
                 total += sum(1 for _ in self._select(block, wanted, None, stop_ns))
         return total
-
-
-class BlockLog(IndexedLog):
-    """A log whose messages lie in blocks, each with a known range of log times."""
-
-    def __init__(self, path: Path, form: str) -> None:
-        super().__init__(path, form)
-        self._file: BinaryIO = path.open("rb")
-        self._size = path.stat().st_size
-        self._latest: tuple[Block | None, list[Message]] = (None, [])
-        self._reported: set[int] = set()
-
-    @abc.abstractmethod
-    def _unpack(self, raw: memoryview, torn: bool) -> tuple[list[Message], str]:
-        """The messages of one block in the order of the file, and what is wrong with it (or "").
-
-        Raises:
-            DamagedBlockError: nothing of the block can be used.
-        """
-
-    def _report(self, what: str, offset: int, lost_bytes: int) -> None:
-        where = f"byte {offset} of {self._size}"
-        self.damage.append(Damage(what=what, where=where, affected=lost_bytes / max(1, self._size)))
-
-    def _bytes(self, offset: int, size: int) -> bytes:
-        self._file.seek(offset)
-        return self._file.read(max(0, min(size, self._size - offset)))
-
-    def _read_block(self, offset: int, size: int, *, torn: bool = False) -> list[Message]:
-        """Messages of the block at `offset`, in the order of log time; its damage is noted once."""
-        try:
-            if size > LARGEST_BLOCK_BYTES:
-                raise DamagedBlockError(f"a chunk is said to have {size} bytes, more than are read at once")
-            messages, problem = self._unpack(memoryview(self._bytes(offset, size)), torn)
-        except DamagedBlockError as error:
-            messages, problem = [], str(error)
-        if problem and offset not in self._reported:
-            self._reported.add(offset)
-            self._report(problem, offset, size)
-        messages.sort(key=lambda message: message.log_ns)
-        return messages
-
-    def _load(self, block: Block) -> list[Message]:
-        if self._latest[0] is not block:
-            self._latest = (block, self._read_block(block.offset, block.size, torn=block.torn))
-        return self._latest[1]
-
-    def _take(self, offset: int, size: int, *, torn: bool = False) -> int:
-        """Read one block while scanning, count what it holds, keep where it lies; the number of its messages."""
-        messages = self._read_block(offset, size, torn=torn)
-        counts = Counter(message.channel for message in messages)
-        for message in messages:
-            message.channel.note(message.log_ns)
-        if messages:
-            self._blocks.append(Block(offset, size, messages[0].log_ns, messages[-1].log_ns, counts, torn))
-        return len(messages)
-
-    def _find_edges(self) -> None:
-        """Fill in the first and last log time of every channel, from the blocks that can hold them."""
-        for block in sorted(self._blocks, key=lambda b: b.first_ns):
-            open_ends = {c for c in block.channels if c.first_ns < 0 or block.first_ns < c.first_ns}
-            for message in self._load(block) if open_ends else ():
-                channel = message.channel
-                if channel in open_ends and (channel.first_ns < 0 or message.log_ns < channel.first_ns):
-                    channel.first_ns = message.log_ns
-        for block in sorted(self._blocks, key=lambda b: -b.last_ns):
-            open_ends = {c for c in block.channels if block.last_ns > c.last_ns}
-            for message in self._load(block) if open_ends else ():
-                if message.channel in open_ends:
-                    message.channel.last_ns = max(message.channel.last_ns, message.log_ns)
-
-    def _select(
-        self, block: Block, channels: Collection[Channel], start_ns: int | None, stop_ns: int | None
-    ) -> Iterator[Message]:
-        for message in self._load(block):
-            if message.channel not in channels:
-                continue
-            if start_ns is not None and message.log_ns < start_ns:
-                continue
-            if stop_ns is not None and message.log_ns >= stop_ns:
-                continue
-            yield message
-
-    def close(self) -> None:
-        """Release the file."""
-        self._latest = (None, [])
-        self._file.close()
 
 
 class _Codecs(threading.local):
@@ -382,3 +296,8 @@ def _unpack(compression: str, data: Buffer, size: int, limit: int, torn: bool) -
 def text(raw: Buffer) -> str:
     """Decode UTF-8; bytes that are not UTF-8 come out as backslash escapes."""
     return bytes(raw).decode("utf-8", "backslashreplace")
+
+
+def name(raw: Buffer) -> str:
+    """Decode a name; control characters come out as backslash escapes too, so that it can be shown anywhere."""
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text(raw))

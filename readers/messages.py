@@ -80,9 +80,12 @@ class Arrival:
 
         Call it last: it takes the oddities found so far with it.
         """
+        return self.stamps_ns(None if stamp is None else stamp_ns(stamp))
+
+    def stamps_ns(self, own_ns: int | None) -> Stamps:
+        """The same of a stamp in nanoseconds, None for none."""
         t_ns = self.received_ns
-        if stamp is not None:
-            own_ns = stamp_ns(stamp)
+        if own_ns is not None:
             if not sane_stamp(own_ns, self.received_ns):
                 self.oddities.append("foreign_stamp")
             elif not self.trust_stamps:
@@ -129,10 +132,17 @@ def _vector(v: Any) -> FloatArray:
     return array(v.x, v.y, v.z)
 
 
+def _xyzw(q: Any) -> FloatArray:
+    return array(q.x, q.y, q.z, q.w)
+
+
 def _quaternion(q: Any, arrival: Arrival) -> FloatArray:
     """Orientation x, y, z, w; NaN for an all-zero one, scaled where it is not of unit norm. Both are noted."""
-    quat = array(q.x, q.y, q.z, q.w)
-    norm = math.hypot(*quat)
+    return _unit(_xyzw(q), arrival)
+
+
+def _unit(quat: FloatArray, arrival: Arrival) -> FloatArray:
+    norm = math.hypot(*quat.tolist())
     if norm == 0.0:
         arrival.oddities.append("zero_quaternion")
         return UNKNOWN_QUAT
@@ -176,18 +186,44 @@ def _bytes(data: Any) -> bytes | memoryview:
 
 def image(message: Any, arrival: Arrival) -> ImageSample:
     """sensor_msgs/Image and foxglove.RawImage: the pixels stay where they are in the message."""
-    payload = _bytes(message.data)
-    height, step = int(message.height), int(message.step)
-    if height * step > len(payload):
-        raise MessageError(f"the image states {height} rows of {step} bytes and holds {len(payload)} bytes")
+    stamp = header_stamp(message)
+    return image_sample(
+        arrival,
+        None if stamp is None else stamp_ns(stamp),
+        str(message.encoding),
+        _bytes(message.data),
+        int(message.width),
+        int(message.height),
+        int(message.step),
+        bool(getattr(message, "is_bigendian", False)),
+    )
+
+
+def image_sample(
+    arrival: Arrival,
+    own_ns: int | None,
+    encoding: str,
+    payload: bytes | memoryview,
+    width_px: int,
+    height_px: int,
+    step_bytes: int,
+    big_endian: bool,
+) -> ImageSample:
+    """An image whose pixels are the rows of `payload`.
+
+    Raises:
+        MessageError: they are fewer than it states.
+    """
+    if height_px * step_bytes > len(payload):
+        raise MessageError(f"the image states {height_px} rows of {step_bytes} bytes and holds {len(payload)} bytes")
     return ImageSample(
-        **arrival.stamps(header_stamp(message)),
-        encoding=str(message.encoding),
+        **arrival.stamps_ns(own_ns),
+        encoding=encoding,
         payload=payload,
-        width_px=int(message.width),
-        height_px=height,
-        step_bytes=step,
-        big_endian=bool(getattr(message, "is_bigendian", False)),
+        width_px=width_px,
+        height_px=height_px,
+        step_bytes=step_bytes,
+        big_endian=big_endian,
         source=arrival.source,
     )
 
@@ -253,17 +289,37 @@ def _distortion_model(stated: str, distortion: FloatArray) -> str:
 
 
 def imu(message: Any, arrival: Arrival) -> ImuSample:
-    """sensor_msgs/Imu; what a covariance that begins with -1 marks as not measured is NaN."""
-    unmeasured = [message.orientation_covariance[0], message.angular_velocity_covariance[0]]
-    unmeasured.append(message.linear_acceleration_covariance[0])
-    no_quat, no_rate, no_force = (value == -1.0 for value in unmeasured)
-    quat = UNKNOWN_QUAT if no_quat else _quaternion(message.orientation, arrival)
-    if quat[3] == 1.0 and not np.any(quat[:3]) and not np.any(message.orientation_covariance):
+    """sensor_msgs/Imu."""
+    return imu_sample(
+        arrival,
+        stamp_ns(message.header.stamp),
+        _xyzw(message.orientation),
+        array(*message.orientation_covariance),
+        _vector(message.angular_velocity),
+        message.angular_velocity_covariance[0],
+        _vector(message.linear_acceleration),
+        message.linear_acceleration_covariance[0],
+    )
+
+
+def imu_sample(
+    arrival: Arrival,
+    own_ns: int,
+    quat: FloatArray,
+    quat_covariance: FloatArray,
+    rate_radps: FloatArray,
+    rate_variance: float,
+    force_mps2: FloatArray,
+    force_variance: float,
+) -> ImuSample:
+    """An inertial measurement; what a covariance that begins with -1 marks as not measured is NaN."""
+    quat = UNKNOWN_QUAT if quat_covariance[0] == -1.0 else _unit(quat, arrival)
+    if quat[3] == 1.0 and not np.any(quat[:3]) and not np.any(quat_covariance):
         arrival.oddities.append("identity_orientation")
     return ImuSample(
-        **arrival.stamps(message.header.stamp),
-        angular_velocity_radps=UNKNOWN_VEC3 if no_rate else _vector(message.angular_velocity),
-        linear_acceleration_mps2=UNKNOWN_VEC3 if no_force else _vector(message.linear_acceleration),
+        **arrival.stamps_ns(own_ns),
+        angular_velocity_radps=UNKNOWN_VEC3 if rate_variance == -1.0 else rate_radps,
+        linear_acceleration_mps2=UNKNOWN_VEC3 if force_variance == -1.0 else force_mps2,
         quat_xyzw=quat,
     )
 
@@ -271,12 +327,31 @@ def imu(message: Any, arrival: Arrival) -> ImuSample:
 def odometry(message: Any, arrival: Arrival) -> OdometrySample:
     """nav_msgs/Odometry: twist in the child frame, pose in the header's frame."""
     pose, twist = message.pose.pose, message.twist.twist
-    quat = _quaternion(pose.orientation, arrival)
+    return odometry_sample(
+        arrival,
+        stamp_ns(message.header.stamp),
+        _vector(pose.position),
+        _xyzw(pose.orientation),
+        _vector(twist.linear),
+        _vector(twist.angular),
+    )
+
+
+def odometry_sample(
+    arrival: Arrival,
+    own_ns: int,
+    position_m: FloatArray,
+    quat: FloatArray,
+    velocity_mps: FloatArray,
+    rate_radps: FloatArray,
+) -> OdometrySample:
+    """A pose with velocities."""
+    quat = _unit(quat, arrival)
     return OdometrySample(
-        **arrival.stamps(message.header.stamp),
-        linear_velocity_mps=_vector(twist.linear),
-        angular_velocity_radps=_vector(twist.angular),
-        position_m=_vector(pose.position),
+        **arrival.stamps_ns(own_ns),
+        linear_velocity_mps=velocity_mps,
+        angular_velocity_radps=rate_radps,
+        position_m=position_m,
         quat_xyzw=quat,
     )
 

@@ -1,0 +1,241 @@
+"""How fast logs are read beside other readers, in CPU time.
+
+    python benchmarks/reading.py [--seconds 75] [--passes 3] [--codecs none lz4 zstd]
+
+The log is 512 x 512 mono8 at 20 Hz of a noisy texture, IMU at 200 Hz and odometry at 50 Hz, in chunks of 1 MiB. Every
+figure is the least CPU time of several passes of this process; a reader and its peer take turns. Extra memory is
+anonymous memory of a process of its own.
+"""
+
+from __future__ import annotations
+
+import argparse
+import subprocess
+import sys
+import tempfile
+import time
+import warnings
+from collections.abc import Callable, Iterable
+from pathlib import Path
+
+import lz4.frame  # type: ignore[import-untyped, unused-ignore]
+import numpy as np
+import zstandard
+from mcap.reader import make_reader
+from mcap.writer import CompressionType, Writer
+from rosbags.highlevel import AnyReader
+from rosbags.typesys import Stores, get_typestore
+
+from readers import open_recording
+from readers.mcap_log import McapLog
+from readers.mcap_records import HEAD, read_chunk_head
+from readers.message_log import in_log_order
+
+SIDE_PX, IMAGE_HZ, IMU_HZ, ODOMETRY_HZ = 512, 20, 200, 50
+START_NS, SECOND_NS = 1_700_000_000_000_000_000, 1_000_000_000
+TYPES = {"/image": "sensor_msgs/msg/Image", "/imu": "sensor_msgs/msg/Imu", "/odom": "nav_msgs/msg/Odometry"}
+Work = Callable[[], object]
+
+
+def make(path: Path, codec: str, seconds: int) -> None:
+    """Write the log."""
+    store = get_typestore(Stores.LATEST)
+    rng = np.random.default_rng(7)
+    texture = rng.normal(128, 40, (SIDE_PX * 2, SIDE_PX * 2))
+    for _ in range(3):
+        texture = (texture + np.roll(texture, 1, 0) + np.roll(texture, 1, 1) + np.roll(texture, -1, 0)) / 4
+    with path.open("wb") as file:
+        writer = Writer(file, chunk_size=1 << 20, compression=CompressionType[codec.upper()])
+        writer.start(profile="ros2", library="benchmark")
+        channels = {}
+        for topic, kind in TYPES.items():
+            text = store.generate_msgdef(kind, ros_version=2)[0].encode()
+            channels[topic] = writer.register_channel(topic, "cdr", writer.register_schema(kind, "ros2msg", text))
+        for i in range(seconds * IMU_HZ):
+            t_ns = START_NS + i * SECOND_NS // IMU_HZ
+            topics = (
+                ["/imu"] + ["/odom"] * (i % (IMU_HZ // ODOMETRY_HZ) == 0) + ["/image"] * (i % (IMU_HZ // IMAGE_HZ) == 0)
+            )
+            for topic in topics:
+                data = bytes(store.serialize_cdr(_message(store, topic, t_ns, i, texture, rng), TYPES[topic]))
+                writer.add_message(channels[topic], t_ns, data, t_ns)
+        writer.finish()
+
+
+def _message(store, topic: str, t_ns: int, i: int, texture, rng):
+    kinds = store.types
+    stamp = kinds["builtin_interfaces/msg/Time"](sec=t_ns // SECOND_NS, nanosec=t_ns % SECOND_NS)
+    header = kinds["std_msgs/msg/Header"](stamp=stamp, frame_id="base_link")
+    vector = kinds["geometry_msgs/msg/Vector3"]
+    turn = kinds["geometry_msgs/msg/Quaternion"](x=0.0, y=0.0, z=0.6, w=0.8)
+    if topic == "/imu":
+        nine = np.zeros(9)
+        return kinds[TYPES[topic]](header, turn, nine, vector(0.1, 0.2, i * 1.0), nine, vector(0.0, 0.0, 9.81), nine)
+    if topic == "/odom":
+        zeros = np.zeros(36)
+        pose = kinds["geometry_msgs/msg/Pose"](kinds["geometry_msgs/msg/Point"](i * 0.1, 0.0, 0.0), turn)
+        twist = kinds["geometry_msgs/msg/Twist"](vector(1.0, 0.0, 0.0), vector(0.0, 0.0, 0.1))
+        return kinds[TYPES[topic]](
+            header,
+            "base_link",
+            kinds["geometry_msgs/msg/PoseWithCovariance"](pose, zeros),
+            kinds["geometry_msgs/msg/TwistWithCovariance"](twist, zeros),
+        )
+    u = (i // 10) % SIDE_PX
+    pixels = texture[u : u + SIDE_PX, u : u + SIDE_PX] + rng.normal(0, 2.5, (SIDE_PX, SIDE_PX))
+    grey = np.clip(pixels, 0, 255).astype(np.uint8).reshape(-1)
+    return kinds[TYPES[topic]](header, SIDE_PX, SIDE_PX, "mono8", 0, SIDE_PX, grey)
+
+
+# ------------------------------------------------------------------------------------ work
+
+
+def drain(messages: Iterable[object]) -> int:
+    """How many there are."""
+    return sum(1 for _ in messages)
+
+
+def own_raw(path: Path, topics: tuple[str, ...] = (), start_ns: int | None = None, stop_ns: int | None = None) -> int:
+    """All messages as views, from opening to the last."""
+    log = McapLog(path)
+    channels = [channel for channel in log.channels if not topics or channel.topic in topics]
+    count = drain(in_log_order(log.sources(channels, start_ns, stop_ns)))
+    log.close()
+    return count
+
+
+def own_samples(path: Path) -> int:
+    """All samples in the order of their stamps, from opening to the last; an image is a view of its pixels."""
+    with open_recording(path) as recording:
+        return drain(recording.read(["/image", "/imu"]))
+
+
+def peer_raw(path: Path, topics: tuple[str, ...] = (), start_ns: int | None = None, stop_ns: int | None = None) -> int:
+    """The same with `mcap`, which does not compare checksums unless it is told to."""
+    with path.open("rb") as file:
+        reader = make_reader(file)
+        return drain(reader.iter_messages(list(topics) or None, start_time=start_ns, end_time=stop_ns))
+
+
+def rosbags_decoded(path: Path) -> int:
+    """The same with `rosbags`."""
+    with AnyReader([path]) as reader:
+        wanted = [connection for connection in reader.connections if connection.topic in ("/image", "/imu")]
+        return drain(reader.deserialize(raw, c.msgtype) for c, _, raw in reader.messages(wanted))
+
+
+def decompression(path: Path) -> Work:
+    """Unpack every chunk and do nothing with it."""
+    log = McapLog(path)
+    view = log.view
+    packed = []
+    for block in log._blocks:
+        body = view[block.offset + HEAD.size : block.offset + block.size]
+        head = read_chunk_head(body)
+        packed.append((head.compression, body[head.start : head.stop], head.unpacked_bytes))
+    zstd, lz4_frame = zstandard.ZstdDecompressor(), lz4.frame.LZ4FrameDecompressor()
+
+    def unpack() -> int:
+        total = 0
+        for compression, data, size in packed:
+            if compression == "zstd":
+                total += len(zstd.decompress(data))
+            elif compression == "lz4":
+                lz4_frame.reset()
+                total += len(lz4_frame.decompress(data, max_length=size + 1))
+        return total
+
+    return unpack
+
+
+# ---------------------------------------------------------------------------------- figures
+
+
+def least(works: dict[str, Work], passes: int) -> dict[str, float]:
+    """Least CPU time of each, in ms; they take turns."""
+    best = dict.fromkeys(works, float("inf"))
+    for _ in range(passes):
+        for name, work in works.items():
+            begun = time.process_time()
+            work()
+            best[name] = min(best[name], 1e3 * (time.process_time() - begun))
+    return best
+
+
+MEMORY = """
+import sys, pathlib
+sys.path.insert(0, sys.argv[2])
+from benchmarks.reading import own_raw
+def anonymous():
+    lines = pathlib.Path("/proc/self/status").read_text().splitlines()
+    return next(int(line.split()[1]) for line in lines if line.startswith("RssAnon"))
+import threading, time
+before, peak, over = anonymous(), 0, False
+def watch():
+    global peak
+    while not over:
+        peak = max(peak, anonymous()); time.sleep(0.002)
+thread = threading.Thread(target=watch); thread.start()
+own_raw(pathlib.Path(sys.argv[1])); over = True; thread.join()
+print((peak - before) / 1024)
+"""
+
+
+def extra_mib(path: Path) -> float:
+    """Peak of the anonymous memory that reading the whole log takes, in MiB."""
+    root = str(Path(__file__).parents[1])
+    return float(
+        subprocess.run(
+            [sys.executable, "-c", MEMORY, str(path), root], capture_output=True, text=True, check=True
+        ).stdout
+    )
+
+
+def bars(path: Path, codec: str, seconds: int, passes: int) -> list[tuple[str, float, float, float]]:
+    """Name, own figure, ratio to the peer, and the ratio that is allowed."""
+    middle = START_NS + seconds * SECOND_NS // 2
+    window = (("/image",), middle, middle + SECOND_NS)
+    found = least(
+        {
+            "unpack": decompression(path),
+            "raw": lambda: own_raw(path),
+            "imu": lambda: own_raw(path, ("/imu",)),
+            "mcap": lambda: peer_raw(path),
+            "samples": lambda: own_samples(path),
+            "rosbags": lambda: rosbags_decoded(path),
+            "window": lambda: own_raw(path, *window),
+            "mcap window": lambda: peer_raw(path, *window),
+        },
+        passes,
+    )
+    rows = [("raw / mcap", found["raw"], found["raw"] / found["mcap"], 0.10 if codec == "none" else float("nan"))]
+    if codec != "none":
+        rows.append(("raw / decompression", found["raw"], found["raw"] / found["unpack"], 1.35))
+    limit = 0.10 if codec == "none" else 0.35
+    rows.append(("image + imu samples / rosbags", found["samples"], found["samples"] / found["rosbags"], limit))
+    rows.append(("1 s of images / mcap", found["window"], found["window"] / found["mcap window"], 0.7))
+    rows.append(("/imu alone / mcap all", found["imu"], found["imu"] / found["mcap"], float("nan")))
+    rows.append(("extra memory, MiB", extra_mib(path), float("nan"), 32.0))
+    return rows
+
+
+def main() -> None:
+    """Print the figures of every codec."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--seconds", type=int, default=75)
+    parser.add_argument("--passes", type=int, default=3)
+    parser.add_argument("--codecs", nargs="+", default=["none", "lz4", "zstd"])
+    options = parser.parse_args()
+    warnings.simplefilter("ignore")
+    with tempfile.TemporaryDirectory() as folder:
+        for codec in options.codecs:
+            path = Path(folder) / f"{codec}.mcap"
+            make(path, codec, options.seconds)
+            print(f"{codec}: {path.stat().st_size / 1e6:.0f} MB")
+            for name, own, ratio, bar in bars(path, codec, options.seconds, options.passes):
+                print(f"  {name:32} {own:9.1f}  ratio {ratio:6.3f}  bar {bar:.2f}")
+            path.unlink()
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,170 @@
+"""CDR messages of the commonest types → samples, straight from their bytes.
+
+Only where a channel's definition is that of the standard type, and only for messages whose length is exactly the one
+that their fields add up to; everything else is left to the generic decoding, which has the words for what is wrong.
+The layout is that of plain little-endian CDR: a field lies at a multiple of its size from byte 4 on.
+"""
+
+from __future__ import annotations
+
+import struct
+from collections.abc import Callable
+
+import numpy as np
+
+from readers.decoding import ros_name
+from readers.message_log import Buffer, Channel, text
+from readers.messages import Arrival, image_sample, imu_sample, odometry_sample
+from readers.streams import Sample
+
+FixedReader = Callable[[Buffer, Arrival], Sample | None]
+Fields = tuple[str, ...]
+
+_VECTOR: Fields = ("float64 x", "float64 y", "float64 z")
+_QUATERNION: Fields = (*_VECTOR, "float64 w")
+_PARTS: dict[str, Fields] = {
+    "std_msgs/Header": ("builtin_interfaces/Time stamp", "string frame_id"),
+    "builtin_interfaces/Time": ("int32 sec", "uint32 nanosec"),
+    "geometry_msgs/Vector3": _VECTOR,
+    "geometry_msgs/Point": _VECTOR,
+    "geometry_msgs/Quaternion": _QUATERNION,
+    "geometry_msgs/Pose": ("Point position", "Quaternion orientation"),
+    "geometry_msgs/Twist": ("Vector3 linear", "Vector3 angular"),
+    "geometry_msgs/PoseWithCovariance": ("Pose pose", "float64[36] covariance"),
+    "geometry_msgs/TwistWithCovariance": ("Twist twist", "float64[36] covariance"),
+    "sensor_msgs/Image": (
+        "std_msgs/Header header",
+        "uint32 height",
+        "uint32 width",
+        "string encoding",
+        "uint8 is_bigendian",
+        "uint32 step",
+        "uint8[] data",
+    ),
+    "sensor_msgs/Imu": (
+        "std_msgs/Header header",
+        "geometry_msgs/Quaternion orientation",
+        "float64[9] orientation_covariance",
+        "geometry_msgs/Vector3 angular_velocity",
+        "float64[9] angular_velocity_covariance",
+        "geometry_msgs/Vector3 linear_acceleration",
+        "float64[9] linear_acceleration_covariance",
+    ),
+    "nav_msgs/Odometry": (
+        "std_msgs/Header header",
+        "string child_frame_id",
+        "geometry_msgs/PoseWithCovariance pose",
+        "geometry_msgs/TwistWithCovariance twist",
+    ),
+}
+_STANDARD = {name: tuple(field.rpartition("/")[2] for field in fields) for name, fields in _PARTS.items()}
+_START = struct.Struct("<4siII")
+_U32 = struct.Struct("<I")
+_IMAGE_SIZE = struct.Struct("<II")
+_IMU_NUMBERS, _ODOMETRY_NUMBERS = 37, 85
+_FLOAT = np.dtype("<f8")
+_LITTLE_ENDIAN = b"\0\1\0\0"
+
+
+def fixed_reader(channel: Channel) -> FixedReader | None:
+    """The function that reads the channel's messages by their fixed layout; None if there is none for it.
+
+    What it gives is None for a message that it leaves to the generic decoding.
+    """
+    name = ros_name(channel.type).replace("/msg/", "/")
+    if channel.encoding != "cdr" or name not in _READERS:
+        return None
+    if channel.schema.strip() and (channel.schema_encoding != "ros2msg" or not _is_standard(name, channel.schema)):
+        return None
+    return _READERS[name]
+
+
+def header_of(data: Buffer) -> tuple[int, str] | None:
+    """Stamp in ns and frame of a message that begins with a header; None if it is not little-endian CDR."""
+    found = _header(data)
+    return None if found is None else (found[0], text(data[_START.size : found[1]]).rstrip("\0").lstrip("/"))
+
+
+def _is_standard(name: str, schema: bytes) -> bool:
+    """Whether a definition, and those of its parts that come with it, have the fields of the standard types."""
+    definition = name
+    fields: dict[str, list[str]] = {name: []}
+    for line in text(schema).splitlines():
+        words = line.partition("#")[0].split()
+        if line.startswith("====="):
+            continue
+        if words[:1] == ["MSG:"] and len(words) == 2:
+            definition = words[1].replace("/msg/", "/")
+            fields[definition] = []
+        elif len(words) >= 2 and "=" not in line.partition("#")[0]:
+            fields[definition].append(f"{words[0].rpartition('/')[2]} {words[1]}")
+    return all(tuple(found) == _STANDARD.get(part) for part, found in fields.items()) and _complete(name, fields)
+
+
+def _complete(name: str, fields: dict[str, list[str]]) -> bool:
+    """Whether all parts of a definition come with it."""
+    needed = {field.split()[0].partition("[")[0] for found in fields.values() for field in found}
+    plain = {"float64", "uint32", "int32", "uint8", "string"}
+    return needed - plain <= {part.rpartition("/")[2] for part in fields}
+
+
+def _header(data: Buffer) -> tuple[int, int] | None:
+    """Stamp in ns, and where the frame's name ends."""
+    if len(data) < _START.size:
+        return None
+    kind, seconds, nanoseconds, length = _START.unpack_from(data)
+    end = _START.size + length
+    if kind != _LITTLE_ENDIAN or end > len(data):
+        return None
+    return seconds * 1_000_000_000 + nanoseconds, end
+
+
+def _imu(data: Buffer, arrival: Arrival) -> Sample | None:
+    if (header := _header(data)) is None:
+        return None
+    at = header[1] + (4 - header[1]) % 8
+    if at + 8 * _IMU_NUMBERS != len(data):
+        return None
+    n = np.frombuffer(bytes(data[at:]), _FLOAT)  # a copy, which does not keep the chunk, and read-only
+    return imu_sample(arrival, header[0], n[:4], n[4:13], n[13:16], n[16], n[25:28], n[28])
+
+
+def _odometry(data: Buffer, arrival: Arrival) -> Sample | None:
+    if (header := _header(data)) is None:
+        return None
+    at = header[1] + -header[1] % 4
+    if at + 4 > len(data):
+        return None
+    at += 4 + _U32.unpack_from(data, at)[0]
+    at += (4 - at) % 8
+    if at + 8 * _ODOMETRY_NUMBERS != len(data):
+        return None
+    n = np.frombuffer(bytes(data[at:]), _FLOAT)
+    return odometry_sample(arrival, header[0], n[:3], n[3:7], n[43:46], n[46:49])
+
+
+def _image(data: Buffer, arrival: Arrival) -> Sample | None:
+    if (header := _header(data)) is None:
+        return None
+    at = header[1] + -header[1] % 4
+    if at + 12 > len(data):
+        return None
+    height, width = _IMAGE_SIZE.unpack_from(data, at)
+    (length,) = _U32.unpack_from(data, at + 8)
+    end = at + 12 + length
+    step_at = end + 1 + -(end + 1) % 4
+    if length == 0 or step_at + 8 > len(data):
+        return None
+    step, size = _IMAGE_SIZE.unpack_from(data, step_at)
+    pixels = memoryview(data)[step_at + 8 :]
+    if size != len(pixels):
+        return None
+    encoding = text(data[at + 12 : end - 1])
+    return image_sample(arrival, header[0], encoding, pixels, width, height, step, bool(data[end]))
+
+
+_READERS: dict[str, FixedReader] = {
+    "sensor_msgs/Image": _image,
+    "sensor_msgs/Imu": _imu,
+    "nav_msgs/Odometry": _odometry,
+}
