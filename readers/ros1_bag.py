@@ -38,7 +38,7 @@ _CHUNK_MARK = b"\x04\0\0\0op=\x05"
 _MESSAGE_MARK = b"\x04\0\0\0op=\x02"
 _LONGEST_CHUNK_HEADER = 80
 _LONGEST_HEADER = 1 << 20
-KEPT_BYTES = 8 << 20
+KEPT_CHUNKS, KEPT_CHUNK_BYTES = 8, 1 << 20
 _COMPRESSIONS = (b"none", b"bz2", b"lz4")
 _END_OF_TIME = 1 << 63
 _SECOND_NS = np.uint64(1_000_000_000)
@@ -529,8 +529,8 @@ class Ros1Log(MessageLog):
         record = chunk.record
         packed = self._data[record.start : record.stop]
         data = inflate(text(record.fields[b"compression"]), packed, record.u32(b"size"), torn=record.torn)
-        if chunk.packed and len(data) <= KEPT_BYTES // 8:
-            while len(self._kept) >= 8:
+        if chunk.packed and len(data) <= KEPT_CHUNK_BYTES:
+            while len(self._kept) >= KEPT_CHUNKS:
                 self._kept.pop(next(iter(self._kept)), None)
             self._kept[chunk] = data
         return data
