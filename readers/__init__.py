@@ -6,10 +6,9 @@ folder, not only from its name, and imports the reader of that format when it is
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from importlib.metadata import entry_points
 from pathlib import Path
-from types import MappingProxyType
 from typing import TYPE_CHECKING
 
 from readers.streams import ReadOptions, Recording, RecordingError, WorkbenchError
@@ -17,6 +16,7 @@ from readers.streams import ReadOptions, Recording, RecordingError, WorkbenchErr
 if TYPE_CHECKING:
     from tempfile import TemporaryDirectory
 
+    from readers.bag_folder import BagMetadata
     from readers.message_log import MessageLog
 
 __all__ = ["ReadOptions", "Recording", "RecordingError", "open_recording"]
@@ -118,15 +118,15 @@ def _open_log(path: Path, scratch: list[TemporaryDirectory[str]]) -> MessageLog 
 
         return McapLog(path)
     if start.startswith(ROS1):
-        from readers.rosbag import Ros1Log
+        from readers.ros1_bag import Ros1Log
 
         return Ros1Log(path)
     if start.startswith(SQLITE):
-        from readers.rosbag import SqliteLog
+        from readers.ros2_db3 import SqliteLog
 
         return SqliteLog(path)
     if start.startswith(ZSTD):
-        from readers.rosbag import unpack
+        from readers.bag_folder import unpack
 
         try:
             return _open_log(unpack(path, scratch), scratch)
@@ -169,7 +169,7 @@ def _is_bag_folder(path: Path) -> bool:
 
 
 def _open_bag_folder(path: Path, options: ReadOptions) -> Recording:
-    from readers.rosbag import read_metadata
+    from readers.bag_folder import read_metadata
 
     files = _storage_files(path)
     metadata = read_metadata(path)
@@ -183,14 +183,14 @@ def _open_bag_folder(path: Path, options: ReadOptions) -> Recording:
     notes += [f"The bag's file {name} is missing; the others are read." for name in missing]
     extra = sorted(file.name for file in files if file not in found)
     notes += [f"{name} is not listed in metadata.yaml and was not read." for name in extra]
-    return _join(path, found, options, "ROS 2 bag", notes, metadata.formats)
+    return _join(path, found, options, "ROS 2 bag", notes, metadata)
 
 
 def _open_parts(
     path: Path, files: Sequence[Path], options: ReadOptions, form: str, notes: Sequence[str] = ()
 ) -> Recording:
     """Take files without a list of them for one log, if their names differ in numbers only."""
-    from readers.rosbag import natural_key
+    from readers.bag_folder import natural_key
 
     files = sorted(files, key=lambda file: natural_key(file.name))
     shapes = {"".join(part for number, part in natural_key(file.name) if number < 0) for file in files}
@@ -206,9 +206,9 @@ def _join(
     options: ReadOptions,
     form: str,
     notes: Sequence[str],
-    formats: Mapping[str, str] = MappingProxyType({}),
+    metadata: BagMetadata | None = None,
 ) -> Recording:
-    """One recording of several files; `formats` is what metadata.yaml says of each topic's serialisation."""
+    """One recording of several files, compared with what metadata.yaml says of its topics."""
     from readers.log_recording import LogRecording
 
     logs: list[MessageLog] = []
@@ -226,15 +226,27 @@ def _join(
             remarks.append(f"{file.name} is left out: {error.problem}.")
     if not logs:
         raise RecordingError(path, "no file of the bag can be read", remarks[-1])
-    for topic, encoding in {channel.topic: channel.encoding for log in logs for channel in log.channels}.items():
-        if (stated := formats.get(topic, encoding)) != encoding:
-            remarks.append(f"{topic} is {stated} by metadata.yaml and {encoding} by its file, which was believed.")
+    if metadata is not None:
+        remarks += _compare(metadata, logs)
     kinds = ", ".join(dict.fromkeys(log.format for log in logs))
     whole = kinds if kinds.startswith(form) else f"{form}, {kinds}"
     count = f", {len(logs)} files" if len(logs) > 1 else ""
     return LogRecording(
         path, logs, options, form=f"{whole}{count}", notes=remarks, scratch=scratch[0] if scratch else None
     )
+
+
+def _compare(metadata: BagMetadata, logs: Sequence[MessageLog]) -> Iterator[str]:
+    """Where metadata.yaml and the files differ; other counts are a loss of the first file, or a lie about it."""
+    from readers.salvage import Cause, Loss
+
+    for topic, encoding in {channel.topic: channel.encoding for log in logs for channel in log.channels}.items():
+        if (stated := metadata.formats.get(topic, encoding)) != encoding:
+            yield f"{topic} is {stated} by metadata.yaml and {encoding} by its file, which was believed."
+        count = sum(channel.count for log in logs for channel in log.channels if channel.topic == topic)
+        if (announced := metadata.counts.get(topic, count)) != count:
+            words = f"metadata.yaml states {announced} messages of {topic}, and the files hold {count}"
+            logs[0].lose(Loss(what=Cause.COUNT, text=words))
 
 
 # ---------------------------------------------------------------------------------- plug-ins

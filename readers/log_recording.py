@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from readers.clock import REORDER_WINDOW_NS, SECOND_NS, merge, reorder, sane_stamp
-from readers.decoding import Decoder, MessageError, decoder_of, definition_text
+from readers.decoding import Decoder, Definitions, MessageError, decoder_of, definition_text
 from readers.fixed_layout import FixedReader, fixed_reader, header_of
 from readers.message_log import Buffer, Channel, Message, MessageLog, Source, in_log_order
 from readers.messages import (
@@ -185,8 +185,7 @@ class LogRecording(Recording):
                 self._look_at(topic)
         return tuple(topics)
 
-    @staticmethod
-    def _topic(name: str, channels: list[Channel]) -> Topic:
+    def _topic(self, name: str, channels: list[Channel]) -> Topic:
         type_name = channels[0].type
         topic = Topic(name=name, channels=channels, reader=reader_of(type_name))
         try:
@@ -198,7 +197,8 @@ class LogRecording(Recording):
                     topic.fixed[channel] = fixed
                     topic.decoders[channel] = partial(_decode_late, channel)
                     continue
-                decoder = decoder_of(channel) if topic.reader or channel.encoding not in ("ros1", "cdr") else None
+                known = topic.reader or channel.encoding not in ("ros1", "cdr")
+                decoder = decoder_of(channel, self.definitions) if known else None
                 if decoder is not None and topic.reader is not None:
                     topic.decoders[channel] = decoder
         except MessageError as error:
@@ -312,8 +312,27 @@ class LogRecording(Recording):
 
     @property
     def losses(self) -> tuple[Loss, ...]:
-        """What could not be read, in the form that can be counted, as far as the files were read by now."""
+        """What of the files could not be read, as far as they were read by now, in the form that can be counted."""
         return tuple(loss for log in self._logs for loss in log.losses)
+
+    @property
+    def definitions(self) -> Definitions:
+        """Where definitions are looked up that the log does not have."""
+        return Definitions(self._options.distribution, self._options.msg_folder)
+
+    @property
+    def channels(self) -> tuple[Channel, ...]:
+        """The channels of all files."""
+        return tuple(channel for log in self._logs for channel in log.channels)
+
+    def messages(
+        self, channels: Collection[Channel] | None = None, start_ns: int | None = None, stop_ns: int | None = None
+    ) -> Iterator[Message]:
+        """The messages of `channels` (all if None) as they are stored, in the order of their log times.
+
+        Those with ``start_ns <= log time < stop_ns``, as far as they can be read.
+        """
+        return self._messages(self.channels if channels is None else channels, start_ns, stop_ns)
 
     # ------------------------------------------------------------------------------ cameras
 

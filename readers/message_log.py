@@ -11,12 +11,11 @@ import bz2
 import heapq
 import re
 import threading
-from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
-from typing import BinaryIO, NamedTuple, Protocol
+from typing import NamedTuple, Protocol
 
 import lz4.frame  # type: ignore[import-untyped, unused-ignore]
 import zstandard
@@ -229,99 +228,11 @@ class IndexedLog(MessageLog):
         return total
 
 
-class BlockLog(IndexedLog):
-    """A log whose messages lie in blocks, each with a known range of log times."""
-
-    def __init__(self, path: Path, form: str) -> None:
-        super().__init__(path, form)
-        self._file: BinaryIO = path.open("rb")
-        self._size = path.stat().st_size
-        self._latest: tuple[Block | None, list[Message]] = (None, [])
-        self._reported: set[int] = set()
-
-    @abc.abstractmethod
-    def _unpack(self, raw: memoryview, torn: bool) -> tuple[list[Message], str]:
-        """The messages of one block in the order of the file, and what is wrong with it (or "").
-
-        Raises:
-            DamagedBlockError: nothing of the block can be used.
-        """
-
-    def _report(self, what: str, offset: int, lost_bytes: int) -> None:
-        where = f"byte {offset} of {self._size}"
-        self.damage.append(Damage(what=what, where=where, affected=lost_bytes / max(1, self._size)))
-
-    def _bytes(self, offset: int, size: int) -> bytes:
-        self._file.seek(offset)
-        return self._file.read(max(0, min(size, self._size - offset)))
-
-    def _read_block(self, offset: int, size: int, *, torn: bool = False) -> list[Message]:
-        """Messages of the block at `offset`, in the order of log time; its damage is noted once."""
-        try:
-            if size > LARGEST_BLOCK_BYTES:
-                raise DamagedBlockError(f"a chunk is said to have {size} bytes, more than are read at once")
-            messages, problem = self._unpack(memoryview(self._bytes(offset, size)), torn)
-        except DamagedBlockError as error:
-            messages, problem = [], str(error)
-        if problem and offset not in self._reported:
-            self._reported.add(offset)
-            self._report(problem, offset, size)
-        messages.sort(key=lambda message: message.log_ns)
-        return messages
-
-    def _load(self, block: Block) -> list[Message]:
-        if self._latest[0] is not block:
-            self._latest = (block, self._read_block(block.offset, block.size, torn=block.torn))
-        return self._latest[1]
-
-    def _take(self, offset: int, size: int, *, torn: bool = False) -> int:
-        """Read one block while scanning, count what it holds, keep where it lies; the number of its messages."""
-        messages = self._read_block(offset, size, torn=torn)
-        counts = Counter(message.channel for message in messages)
-        for message in messages:
-            message.channel.note(message.log_ns)
-        if messages:
-            self._blocks.append(Block(offset, size, messages[0].log_ns, messages[-1].log_ns, counts, torn))
-        return len(messages)
-
-    def _find_edges(self) -> None:
-        """Fill in the first and last log time of every channel, from the blocks that can hold them."""
-        for block in sorted(self._blocks, key=lambda b: b.first_ns):
-            open_ends = {c for c in block.channels if c.first_ns < 0 or block.first_ns < c.first_ns}
-            for message in self._load(block) if open_ends else ():
-                channel = message.channel
-                if channel in open_ends and (channel.first_ns < 0 or message.log_ns < channel.first_ns):
-                    channel.first_ns = message.log_ns
-        for block in sorted(self._blocks, key=lambda b: -b.last_ns):
-            open_ends = {c for c in block.channels if block.last_ns > c.last_ns}
-            for message in self._load(block) if open_ends else ():
-                if message.channel in open_ends:
-                    message.channel.last_ns = max(message.channel.last_ns, message.log_ns)
-
-    def _select(
-        self, block: Block, channels: Collection[Channel], start_ns: int | None, stop_ns: int | None
-    ) -> Iterator[Message]:
-        for message in self._load(block):
-            if message.channel not in channels:
-                continue
-            if start_ns is not None and message.log_ns < start_ns:
-                continue
-            if stop_ns is not None and message.log_ns >= stop_ns:
-                continue
-            yield message
-
-    def close(self) -> None:
-        """Release the file."""
-        self._latest = (None, [])
-        self._file.close()
-
-
 class _Codecs(threading.local):
     """Decompressors, which are made once for each thread."""
 
     def __init__(self) -> None:
         self.zstd = zstandard.ZstdDecompressor()
-        self.lz4 = lz4.frame.LZ4FrameDecompressor()
 
 
 _codecs = _Codecs()
@@ -360,11 +271,11 @@ def _unpack(compression: str, data: Buffer, size: int, limit: int, torn: bool) -
     if compression == "bz2":
         return bz2.BZ2Decompressor().decompress(data, min(size, limit) + 1)
     if compression == "lz4":
-        _codecs.lz4.reset()
-        found: bytes = _codecs.lz4.decompress(data, max_length=min(size, limit) + 1)
-        if not _codecs.lz4.eof and len(found) <= limit and not torn:
-            found += _codecs.lz4.decompress(b"", max_length=limit + 1 - len(found))
-            if not _codecs.lz4.eof and len(found) <= limit:
+        unpacker = lz4.frame.LZ4FrameDecompressor()  # one that met damage goes on to refuse sound data
+        found: bytes = unpacker.decompress(data, max_length=min(size, limit))  # one byte more is ten times as slow
+        if not unpacker.eof and len(found) <= limit and not torn:
+            found += unpacker.decompress(b"", max_length=1)
+            if not unpacker.eof and len(found) <= min(size, limit):
                 raise EOFError("its end is missing")
         return found
     stated = zstandard.frame_content_size(data) if not torn else -1

@@ -13,10 +13,13 @@ from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from types import TracebackType
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 from numpy.typing import NDArray
+
+if TYPE_CHECKING:
+    from readers.salvage import Loss
 
 FloatArray = NDArray[np.float64]
 
@@ -359,7 +362,9 @@ class ReadOptions:
     ``parent, child`` whose transforms in ``/tf`` become pose streams (all pairs found if empty). `clocks` are pairs of
     a topic and the `Clock` that its samples' times come from, ``header`` where none is named; `offsets_ns` pairs of a
     topic and what is added to the times of its samples. `cameras` are the files of calibrations that take the place of
-    the recording's own; `scale_cameras` has calibrations of another image size scaled to the images.
+    the recording's own; `scale_cameras` has calibrations of another image size scaled to the images. Definitions that a
+    log does not have come from the ROS 2 `distribution` (``humble``; the latest if empty), then from the ``.msg`` files
+    of `msg_folder`.
     """
 
     rate_hz: float | None = None
@@ -370,6 +375,8 @@ class ReadOptions:
     offsets_ns: tuple[tuple[str, int], ...] = ()
     cameras: tuple[CameraFile, ...] = ()
     scale_cameras: bool = False
+    distribution: str = ""
+    msg_folder: Path | None = None
 
     def clock_of(self, topic: str) -> Clock:
         """The clock of a topic."""
@@ -479,6 +486,11 @@ class Recording(abc.ABC):
     @property
     def damage(self) -> tuple[Damage, ...]:
         """What of the file is damaged, as far as it was read by now."""
+        return ()
+
+    @property
+    def losses(self) -> tuple[Loss, ...]:
+        """The damage in the form that can be counted by topic, of logs of messages."""
         return ()
 
     @abc.abstractmethod

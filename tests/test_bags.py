@@ -313,17 +313,17 @@ def test_a_damaged_chunk_costs_only_itself(tmp_path: Path) -> None:
     path = write_ros1(tmp_path / "a.bag", drive(ROS1), "bz2")
     data = bytearray(path.read_bytes())
     with open_recording(path) as recording:
-        block = recording._logs[0]._blocks[3]
-        lost = len(recording._logs[0]._load(block))
+        chunk = recording._logs[0]._chunks[3]
+        lost = len(recording._logs[0]._load(chunk))
         total = sum(c.count for c in recording._logs[0].channels)
-    data[block.offset + block.size // 2] ^= 0xFF
+    data[(chunk.record.start + chunk.record.stop) // 2] ^= 0xFF
     path.write_bytes(data)
     with open_recording(path) as recording:
         messages = sum(1 for _ in recording._messages(recording._logs[0].channels))
         assert messages == total - lost
         (harm,) = recording.damage
         assert "bz2" in harm.what
-        assert f"byte {block.offset} " in harm.where
+        assert f"byte {chunk.record.offset} " in harm.where
         assert any(fact.code == "count_differs" for fact in survey(recording))
 
 
@@ -334,7 +334,7 @@ def test_a_bag_with_a_false_index_is_scanned(tmp_path: Path) -> None:
     path.write_bytes(data[:at] + b"\x01\0\0\0" + data[at + 4 :])
     with open_recording(path) as recording:
         assert read_all(recording) == expected_samples(ROS1)
-        assert "not the one that the bag header announces" in recording.damage[0].what
+        assert "the bag header states 1 chunks and 29 are there" in recording.damage[0].what
 
 
 def test_rows_in_a_write_ahead_log_are_read_from_a_copy(tmp_path: Path) -> None:
@@ -383,7 +383,7 @@ def test_rows_without_data_or_time_are_counted(tmp_path: Path) -> None:
     with open_recording(path) as recording:
         samples = list(recording.read())
         assert [isinstance(s, Problem) for s in samples] == [i == 4 for i in range(199)]
-        assert "1 messages have no number as time" in recording.damage[0].what
+        assert "1 messages have no number as time and are left out" in recording.damage[0].what
 
 
 @pytest.mark.parametrize("share", [0.3, 0.6, 0.95])

@@ -103,6 +103,13 @@ Cameras = Annotated[
 ScaleCamera = Annotated[
     bool, typer.Option("--scale-camera", help="Scale a calibration for another image size to the images.")
 ]
+MsgFolder = Annotated[
+    Path | None,
+    typer.Option("--msg", metavar="DIR", help="Folder of .msg files for types that the log does not define."),
+]
+Distribution = Annotated[
+    str, typer.Option("--distro", metavar="NAME", help="ROS 2 distribution of types that the log does not define.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 
 
@@ -138,19 +145,34 @@ def inspect(
     offsets: Offsets = None,
     cameras: Cameras = None,
     scale_camera: ScaleCamera = False,
+    msg: MsgFolder = None,
+    distro: Distribution = "",
 ) -> None:
     """Show what is in a recording: streams, cameras, damage, and what is odd about its clocks."""
     from workbench.session import open_any
 
-    with open_any(path, _options(rate, times, times_unit, tf, clocks, offsets, cameras, scale_camera)) as recording:
+    options = _options(
+        rate, times, times_unit, tf, clocks, offsets, cameras, scale_camera, msg=msg, distribution=distro
+    )
+    with open_any(path, options) as recording:
         facts, clocks_found = ([], {}) if quick else _survey(recording)
-        values = _recording_values(recording, facts) | {"clocks": clocks_found}
+        values = _recording_values(recording, facts) | {"clocks": clocks_found} | _lost(recording, quick)
         if as_json:
             print_json(values)
         else:
             _print_recording(recording, values)
         if values["damage"]:
             raise typer.Exit(IN_PART)
+
+
+def _lost(recording: Recording, quick: bool) -> dict[str, Any]:
+    """The report of loss, where there is one; unless `quick`, all messages are read for what was recovered."""
+    from workbench import loss_report
+
+    if not recording.losses:
+        return {"loss": None}
+    good = {} if quick else loss_report.read_through(recording)
+    return {"loss": loss_report.values(good, recording.losses)}
 
 
 def _survey(recording: Recording) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -236,6 +258,8 @@ def _print_recording(recording: Recording, values: Mapping[str, Any]) -> None:
     print_list("notes", values["notes"])
     print_list("not readable", [_unreadable(info) for info in recording.streams if not info.readable])
     print_list("damage", values["damage"])
+    if values["loss"]:
+        _print_losses(values["loss"])
     print_list("oddities", [f"{fact['stream']}: {fact['sentence']}" for fact in values["facts"]])
 
 
@@ -281,6 +305,64 @@ def _camera_text(camera: Camera) -> str:
     source = f", of {shown(camera.source)}" if camera.source else ""
     lens = shown(camera.distortion_model)
     return f"{size}, f {fx:.6g} {fy:.6g}, centre {cx:.6g} {cy:.6g}, distortion {lens}{source}"
+
+
+# -------------------------------------------------------------------------------- recover
+
+
+@app.command(
+    short_help="Write what can be read of a damaged log as a clean MCAP file.",
+    epilog=examples(
+        "workbench recover mission.bag -o mission.mcap",
+        "workbench recover rosbag2_folder/ -o mission.mcap --json",
+    ),
+)
+def recover(
+    path: Annotated[
+        Path, typer.Argument(metavar="PATH", help="ROS 1 bag, ROS 2 bag or MCAP, or a folder of its parts.")
+    ],
+    out: Annotated[Path, typer.Option("--out", "-o", metavar="OUT.mcap", help="File to write; it must not exist.")],
+    msg: MsgFolder = None,
+    distro: Distribution = "",
+    as_json: AsJson = False,
+) -> None:
+    """Write the readable messages of a log, as they are stored, into an MCAP file with an index; tell what was lost.
+
+    Definitions, encodings and times are kept: messages of ROS 1 stay messages of ROS 1. Ctrl-C ends the file early and
+    leaves it readable. Exit status: 0 nothing was damaged, 3 something was lost, 2 nothing can be read.
+    """
+    from workbench import loss_report
+    from workbench.recovery import recover as write
+    from workbench.session import Progress, open_any
+
+    with (
+        open_any(path, _options(None, None, "auto", None, msg=msg, distribution=distro)) as recording,
+        Bar(out.name, "message") as bar,
+    ):
+        try:
+            done = write(recording, out, on_progress=lambda done, total: bar(Progress(done, total, 0)))
+        except KeyboardInterrupt:
+            print(f"interrupted: {out} holds what was written so far", file=sys.stderr)
+            raise
+    report = loss_report.values(done.good, done.losses)
+    skipped = [{"topic": topic, "count": n, "reason": why} for (topic, why), n in done.skipped.items()]
+    if as_json:
+        print_json({"path": str(out), **report, "damage": list(done.damage), "not_written": skipped})
+    else:
+        print(f"{out}: {sum(good.count for good in done.good.values())} messages of {shown(str(path))}")
+        _print_losses(report)
+        print_list("not written", [f"{one['topic']}: {one['count']} messages: {one['reason']}" for one in skipped])
+        print_list("damage", done.damage)
+    if not done.clean:
+        raise typer.Exit(IN_PART)
+
+
+def _print_losses(report: Mapping[str, Any]) -> None:
+    """Print by topic what was read and what is known to be lost."""
+    from workbench import loss_report
+
+    if found := loss_report.rows(report):
+        print("\n" + "\n".join(table(loss_report.HEADS, found, right=range(1, 7))))
 
 
 # --------------------------------------------------------------------------------- replay
@@ -357,6 +439,8 @@ def replay(
     offsets: Offsets = None,
     cameras: Cameras = None,
     scale_camera: ScaleCamera = False,
+    msg: MsgFolder = None,
+    distro: Distribution = "",
     as_json: AsJson = False,
 ) -> None:
     """Replay a recording through an estimator; write all it computed, and a summary.
@@ -386,7 +470,9 @@ def replay(
         reference=reference,
         reference_offset_s=reference_offset,
         height=height,
-        options=_options(rate, times, times_unit, tf, clocks, offsets, cameras, scale_camera),
+        options=_options(
+            rate, times, times_unit, tf, clocks, offsets, cameras, scale_camera, msg=msg, distribution=distro
+        ),
         calibrate=calibrate,
         smooth=smooth,
         raw_images=_one_of(raw_images, ("png", "raw"), "--raw-images"),
@@ -1110,11 +1196,16 @@ def _options(
     offsets: Sequence[str] | None = None,
     cameras: Sequence[str] | None = None,
     scale_camera: bool = False,
+    *,
+    msg: Path | None = None,
+    distribution: str = "",
 ) -> ReadOptions:
     from readers.streams import ReadOptions, StreamError
 
     if rate is not None and not 0 < rate < float("inf"):
         raise StreamError(f"--rate {rate:g}: a frame rate is a positive number of frames per second")
+    if msg is not None and not msg.is_dir():
+        raise StreamError(f"--msg {msg}: there is no such folder; give one of .msg files")
     pairs = []
     for text in frames or ():
         parent, comma, child = text.partition(",")
@@ -1130,6 +1221,8 @@ def _options(
         offsets_ns=_offsets(offsets or ()),
         cameras=tuple(map(_camera_file, cameras or ())),
         scale_cameras=scale_camera,
+        distribution=distribution,
+        msg_folder=msg,
     )
 
 

@@ -47,7 +47,7 @@ from readers.streams import (
     StreamError,
     StreamInfo,
 )
-from workbench import inputs, manifest, range_inputs
+from workbench import inputs, loss_report, manifest, range_inputs
 from workbench.checkpoints import CHECKPOINT_FRAMES, CheckpointError, CheckpointWriter
 from workbench.range_account import RangeAccount
 from workbench.range_smoothing import Smoothing
@@ -438,8 +438,8 @@ class _Audited(Recording):
         return [f"{fact.stream}: {fact.sentence}" for audit in self.audits.values() for fact in audit.facts()]
 
     def damage_lines(self) -> list[str]:
-        """What of the file was found damaged so far."""
-        return [str(damage) for damage in self.inner.damage]
+        """What of the file was found damaged so far, and what is known to be lost by topic."""
+        return [*(str(damage) for damage in self.inner.damage), *loss_report.sentences(self.inner.losses)]
 
 
 class Account(Protocol):

@@ -88,10 +88,10 @@ def write(
     try:
         _open(target)
         _fill(target, on_progress)
-        with _uninterrupted():
+        with uninterrupted():
             target.finish()
     except KeyboardInterrupt:
-        with _uninterrupted():
+        with uninterrupted():
             _keep(target)
         raise
     except BaseException:
@@ -132,7 +132,7 @@ def _check(recording: Recording, streams: Sequence[str] | None) -> None:
 
 def _open(target: Target) -> None:
     try:
-        with _uninterrupted():
+        with uninterrupted():
             target.open()
     except OSError as error:
         raise RecordingError(target.path, f"it cannot be made ({error.strerror})", "choose another folder") from error
@@ -141,7 +141,7 @@ def _open(target: Target) -> None:
 def _fill(target: Target, on_progress: Progress | None) -> None:
     expected = sum(max(info.count, 0) for info in target.order.infos)
     for done, sample in enumerate(target.samples(), start=1):
-        with _uninterrupted():
+        with uninterrupted():
             target.write(sample)
         if on_progress is not None:
             on_progress(done, max(done, expected))
@@ -156,7 +156,7 @@ def _keep(target: Target) -> None:
 
 
 @contextlib.contextmanager
-def _uninterrupted() -> Iterator[None]:
+def uninterrupted() -> Iterator[None]:
     """Puts off Ctrl-C to the end of the block, so that no message is cut in two."""
     if threading.current_thread() is not threading.main_thread():
         yield

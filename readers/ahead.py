@@ -1,0 +1,65 @@
+"""Blocks of a log unpacked in threads, before they are asked for.
+
+zstd, lz4, bz2 and checksums release Python's global lock, so that a few blocks ahead hide their unpacking behind the
+work that is done on the messages; bz2 blocks are unpacked side by side.
+"""
+
+from __future__ import annotations
+
+import os
+from collections import deque
+from collections.abc import Callable, Iterable
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from functools import lru_cache
+from typing import Generic, TypeVar
+
+Key = TypeVar("Key")
+Value = TypeVar("Value")
+AHEAD_BYTES = 8 << 20
+AHEAD_BLOCKS = 4
+
+
+@lru_cache(maxsize=1)
+def _threads() -> ThreadPoolExecutor:
+    return ThreadPoolExecutor(max_workers=max(2, min(4, os.cpu_count() or 2)), thread_name_prefix="unpack")
+
+
+class Ahead(Generic[Key, Value]):
+    """Results of `load` for keys that will be asked for in the given order, a few of them before they are.
+
+    Args:
+        load: unpacks one block; it runs in a thread, and what it raises comes out of `take`.
+        blocks: the keys, each with the bytes that its result takes.
+    """
+
+    def __init__(self, load: Callable[[Key], Value], blocks: Iterable[tuple[Key, int]]) -> None:
+        self._load = load
+        self._coming = deque(blocks)
+        self._begun: dict[Key, tuple[Future[Value], int]] = {}
+        self._going_on = False
+
+    def take(self, key: Key) -> Value:
+        """The result for `key`. From the second key on the next ones are begun: one alone is no reading through."""
+        future = self._begun.pop(key, (None, 0))[0]
+        if future is None:
+            while self._coming and self._coming.popleft()[0] is not key:
+                pass
+        if self._going_on:
+            self._begin()
+        self._going_on = True
+        return self._load(key) if future is None else future.result()
+
+    def _begin(self) -> None:
+        while self._coming and len(self._begun) < AHEAD_BLOCKS:
+            key, size = self._coming[0]
+            if self._begun and size + sum(begun for _, begun in self._begun.values()) > AHEAD_BYTES:
+                return
+            self._coming.popleft()
+            self._begun[key] = _threads().submit(self._load, key), size
+
+    def stop(self) -> None:
+        """Unpack nothing more, and wait for what is being unpacked: afterwards nobody reads the file."""
+        self._coming.clear()
+        begun = [future for future, _ in self._begun.values()]
+        self._begun.clear()
+        wait([future for future in begun if not future.cancel()])

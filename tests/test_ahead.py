@@ -1,0 +1,65 @@
+"""Blocks unpacked ahead: in order, bounded, errors where they are asked for, nothing after the end."""
+
+import threading
+import time
+
+import pytest
+
+from readers.ahead import AHEAD_BLOCKS, AHEAD_BYTES, Ahead
+
+
+def test_every_block_comes_once_and_no_more_are_begun_than_allowed() -> None:
+    begun: list[int] = []
+    ahead = Ahead(lambda key: begun.append(key) or key * 10, [(key, 1000) for key in range(20)])  # type: ignore[func-returns-value]
+    assert ahead.take(0) == 0
+    assert begun == [0]
+    for key in range(1, 20):
+        assert ahead.take(key) == key * 10
+        assert max(begun) <= key + AHEAD_BLOCKS
+    assert sorted(begun) == list(range(20))
+
+
+def test_large_blocks_are_not_heaped_up() -> None:
+    begun: list[int] = []
+    lock = threading.Lock()
+
+    def load(key: int) -> int:
+        with lock:
+            begun.append(key)
+        return key
+
+    ahead = Ahead(load, [(key, AHEAD_BYTES) for key in range(6)])
+    for key in range(4):
+        assert ahead.take(key) == key
+        assert max(begun) <= key + 1
+
+
+def test_an_error_comes_out_where_its_block_is_asked_for() -> None:
+    def load(key: int) -> int:
+        if key == 3:
+            raise ValueError("three")
+        return key
+
+    ahead = Ahead(load, [(key, 1) for key in range(6)])
+    assert [ahead.take(key) for key in range(3)] == [0, 1, 2]
+    with pytest.raises(ValueError, match="three"):
+        ahead.take(3)
+    assert [ahead.take(5), ahead.take(4)] == [5, 4]
+
+
+def test_nothing_runs_after_stop() -> None:
+    running: list[int] = []
+
+    def load(key: int) -> int:
+        running.append(key)
+        time.sleep(0.02)
+        running.remove(key)
+        return key
+
+    ahead = Ahead(load, [(key, 1) for key in range(10)])
+    ahead.take(0)
+    ahead.take(1)
+    ahead.stop()
+    assert running == []
+    time.sleep(0.05)
+    assert running == []
