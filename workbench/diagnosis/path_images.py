@@ -295,18 +295,35 @@ def _twins(signals: Signals, bounds: Bounds) -> Floats:
 def _repeating(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     twins, clear = _twins(signals, bounds), signals.correlation > bounds["min_correlation"]
     weak = (twins > bounds["weak_share"]) & clear
-    return lasting(extended((twins > bounds["share"]) & clear, weak), int(bounds["min_frames"]))
+    strong = (twins > bounds["share"]) & clear
+    if signals.case["peak_correlation"].shape[1] == 2:
+        strong |= _torn(signals, bounds["pair_ratio"], bounds["pair_correlation"])
+        weak |= _torn(signals, bounds["pair_weak_ratio"], 0.0)
+    return lasting(extended(strong, weak), int(bounds["min_frames"]))
+
+
+def _torn(signals: Signals, ratio: float, correlation: float) -> Bools:
+    """One of a pair of fragments follows a twin peak away from the other one: of a pair no more can agree."""
+    twin = (signals.case["peak_ratio"] > ratio) & (signals.case["peak_correlation"] > correlation)
+    return np.asarray(twin.any(axis=1) & signals.case.rings(Verdict.NOT_RIGID))
 
 
 def _tell_repeating(shown: Shown) -> Told:
     signals, worst = shown.signals, shown.worst
     first, second = (np.asarray(signals.case[name])[worst] for name in ("peak_px", "second_peak_px"))
-    period = float(np.nanmedian(np.hypot(*(second - first).T)))
+    ratio = signals.case["peak_ratio"][worst]
+    k = int(np.nanargmax(ratio))
+    period = float(np.hypot(*(second - first)[k]))
     return (
-        f"In {shown.frames} the correlation has a second peak {100 * signals.peak_ratio[worst]:.0f} % as "
+        f"In {shown.frames} the correlation has a second peak {100 * ratio[k]:.0f} % as "
         f"high as the first, {period:.0f} px away: the ground repeats itself.",
         (
-            evidence(signals, "peak_ratio", signals.peak_ratio, worst, "1", shown.bounds["peak_ratio"]),
+            Evidence(
+                name=f"peak_ratio[{k}]",
+                value=float(ratio[k]),
+                usual=float(usual(signals.peak_ratio)[worst]),
+                bound=shown.bounds["peak_ratio"],
+            ),
             evidence(signals, "peak_correlation", signals.correlation, worst),
             Evidence(name="distance of the peaks", value=period, unit="px"),
         ),
@@ -326,9 +343,12 @@ REPETITIVE = Mode(
         "min_apart_px": 4.5,
         "min_frames": 4,
         "min_correlation": 0.7,
+        "pair_ratio": 0.95,
+        "pair_weak_ratio": 0.75,
+        "pair_correlation": 0.85,
     },
     shows=_repeating,
-    strength=lambda signals, _: signals.peak_ratio,
+    strength=lambda signals, _: np.nanmax(np.nan_to_num(signals.case["peak_ratio"]), axis=1),
     tell=_tell_repeating,
     spoils=True,
 )

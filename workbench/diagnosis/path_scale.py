@@ -12,6 +12,11 @@ from workbench.diagnosis.finding import Bools, Evidence, Floats
 from workbench.diagnosis.path_mode import Bounds, Mode, Shown, Told, evidence
 from workbench.diagnosis.path_signals import Signals, extended, spread_of, usual
 
+SOUND_RESIDUAL = 2.5
+"""What is left of a match that tells a scale is at most this many times the usual."""
+PAIR_STEP = 0.04
+"""A pair of fragments cannot tell a false match from a lift; but a lift takes more than one frame."""
+
 # ------------------------------------------------------------------------- from image to image
 
 
@@ -29,9 +34,13 @@ def height_against_scale(signals: Signals, before: Bools) -> Floats:
     """Logarithm of the camera's height over what W takes it to be, beside what is usual around [n].
 
     The size of the ground's content in the image, from template to template, times W is constant while W follows
-    the height. Frames that something else explains count as if nothing changed, and a steady tilt is taken out.
+    the height. Frames that something else explains, or that do not match, count as if nothing changed; a steady tilt
+    is taken out.
     """
-    case, used, slope = signals.case, signals.agreeing & ~before, tilt_slope(signals, before)
+    matched = signals.residual < SOUND_RESIDUAL * usual(signals.residual)
+    case, used, slope = signals.case, signals.agreeing & matched & ~before, tilt_slope(signals, before)
+    if case["peak_correlation"].shape[1] == 2:
+        used &= np.abs(case["scale"] - 1.0) < PAIR_STEP
     step = np.where(used, np.log(np.where(used, case["scale"], 1.0)), 0.0)
     base = np.where(used & (signals.template_row >= 0), signals.template_row, np.arange(len(step)) - 1)
     size, way = np.zeros(len(step)), np.zeros(len(step))
