@@ -10,6 +10,7 @@ import dataclasses
 import math
 import sys
 from collections.abc import Iterable, Mapping, Sequence
+from fnmatch import fnmatch
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any
 
@@ -40,7 +41,12 @@ if TYPE_CHECKING:
 LINE = 110
 MOST_ODD = 14
 ERRORS = ("x_m", "y_m", "distance_m", "heading_rad")
-MOST_METRICS = 40
+COMPARED = (
+    "frames", "share.*", "drift_percent", "end_error_m", "yaw_drift_deg", "path_length", "ape_m.rmse", "ape_m.max",
+    "ape_heading_deg.rmse", "rpe.*.rmse", "ranging.error.*", "ranging.nis.mean", "ranging.conv*", "verdict.*",
+    "alarm.*",
+)  # fmt: skip
+"""The metrics that are printed for people, in this order."""
 
 RunPath = Annotated[
     Path, typer.Argument(metavar="RUN", help="RUN.rrd or RUN.toml, or a folder with one run", show_default=False)
@@ -318,21 +324,18 @@ def _print_comparison(found: Comparison) -> None:
 
     if not found.one_mission:
         print("the runs are of different recordings: only their metrics are compared\n")
-    rows = [(name, *map(number, values)) for name, values in found.metrics.items() if _tells(values)]
-    more = len(rows) - MOST_METRICS
-    print("\n".join(table(("metric", *found.runs), rows[:MOST_METRICS], right=range(1, len(found.runs) + 1))))
-    if more > 0:
-        print(f"… and {more} more; --json prints all")
+    told = {name: values for name, values in found.metrics.items() if any(map(math.isfinite, values))}
+    shown_first = [name for pattern in COMPARED for name in told if fnmatch(name, pattern)]
+    rows = [(name, *map(number, told[name])) for name in dict.fromkeys(shown_first)]
+    print("\n".join(table(("metric", *found.runs), rows, right=range(1, len(found.runs) + 1))))
+    if len(told) > len(rows):
+        print(f"… and {len(told) - len(rows)} more; --json prints all")
     if found.settings:
         print()
         rows = [(name, *(_setting(value) for value in values)) for name, values in found.settings.items()]
         print("\n".join(table(("setting", *found.runs), rows)))
     for parting in found.partings:
         print_list(f"{parting.run} against {parting.other}", list(_parting_lines(parting)))
-
-
-def _tells(values: Sequence[float]) -> bool:
-    return any(math.isfinite(value) for value in values)
 
 
 def _setting(value: Any) -> str:

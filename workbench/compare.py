@@ -244,8 +244,9 @@ def overlay(runs: Sequence[Run], partings: Sequence[Parting], out: Path) -> None
         RecordingError: a file cannot be read or written.
     """
     from workbench.blueprints import Extent
-    from workbench.rrd import merge
     from workbench.rrd_compare import DifferenceWriter
+    from workbench.rrd_file import APPLICATION
+    from workbench.rrd_reading import merge, without_view
 
     _demand_one_view(runs)
     if out.resolve() in {run.file.resolve() for run in runs}:
@@ -268,7 +269,10 @@ def overlay(runs: Sequence[Run], partings: Sequence[Parting], out: Path) -> None
             for found in partings:
                 writer.differences(found.other, found.run, found.frame, found.t_ns, found.difference)
         sensors = [runs[0].sensors_file] if runs[0].sensors_file.is_file() else []
-        merge([*sensors, *(run.file for run in runs), file], out)
+        parts = [Path(folder) / f"{number}.rrd" for number in range(len(sensors) + len(runs))]
+        for source, part in zip([*sensors, *(run.file for run in runs)], parts, strict=True):
+            without_view(source, part, APPLICATION, runs[0].digest[:32])
+        merge([*parts, file], out)
 
 
 def _demand_one_view(runs: Sequence[Run]) -> None:

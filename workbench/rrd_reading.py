@@ -293,7 +293,7 @@ def stored_rows(path: Path) -> dict[str, int]:
 # ------------------------------------------------------------------------- whole files
 
 
-_CURE = "give a file that a replay wrote"
+CURE = "give a file that a replay wrote"
 
 
 def merge(paths: Sequence[Path | str], out: Path | str) -> None:
@@ -305,6 +305,18 @@ def merge(paths: Sequence[Path | str], out: Path | str) -> None:
     _tool(Path(paths[0]), "merge", *map(str, paths), "-o", str(out))
 
 
+def without_view(path: Path, out: Path, application: str, recording_id: str) -> None:
+    """Copy a recording without the view that it brings along, so that another file's view holds.
+
+    Raises:
+        RecordingError: the file cannot be read.
+    """
+    try:
+        RrdReader(path).store().write_rrd(out, application_id=application, recording_id=recording_id)
+    except RuntimeError as error:
+        raise RecordingError(path, f"cannot be read as a Rerun recording ({error})", CURE) from error
+
+
 def recover(path: Path | str, out: Path | str) -> None:
     """Copy what is whole of an unfinished or torn file and write a footer.
 
@@ -313,7 +325,7 @@ def recover(path: Path | str, out: Path | str) -> None:
     """
     _tool(Path(path), "filter", str(path), "-o", str(out), "--continue-on-error")
     if not RrdReader(out).recordings():
-        raise RecordingError(path, "is not a Rerun recording, or nothing of it is whole", _CURE)
+        raise RecordingError(path, "is not a Rerun recording, or nothing of it is whole", CURE)
 
 
 def _tool(path: Path, *arguments: str) -> None:
@@ -322,4 +334,4 @@ def _tool(path: Path, *arguments: str) -> None:
     )
     if done.returncode:
         reason = (done.stderr.strip().splitlines() or ["no reason given"])[-1]
-        raise RecordingError(path, f"cannot be read as a Rerun recording ({reason})", _CURE)
+        raise RecordingError(path, f"cannot be read as a Rerun recording ({reason})", CURE)
