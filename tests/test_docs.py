@@ -13,11 +13,12 @@ from pipelines.simulation import scenario as making
 from pipelines.simulation.faults import FAULTS
 from pipelines.simulation.scenario import Scenario
 from pipelines.simulation.sections import is_section, meanings
-from workbench import scenario_page, scenarios
+from workbench import scenario_page, scenarios, session
 from workbench.cli import app
 
 ROOT = Path(__file__).parents[1]
 DOCS = ROOT / "docs"
+DEMO = ROOT / "recordings" / "demo.mcap"
 PAGES = (ROOT / "README.md", *sorted(DOCS.glob("*.md")))
 
 
@@ -62,6 +63,20 @@ def test_the_code_on_the_page_of_simulation_runs(
     assert lines[0].startswith("exposure-jump from 1700000000300000000 to 1700000000500000000 ns: {'gain': 1.4")
     assert "EXPOSURE_JUMP" in lines[1]
     assert "FIRST_FRAME" in lines[2]
+
+
+def test_the_code_on_the_page_of_debugging_runs_and_names_the_grating(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    session.run(session.Request(path=DEMO, preset="paper-a", out=tmp_path / "results" / "demo"))
+    monkeypatch.chdir(tmp_path)
+    (block,) = blocks_of("debugging.md", "python")
+    exec(compile(block, "debugging.md", "exec"), {})
+    lines = capsys.readouterr().out.splitlines()
+    assert float(lines[0]) > 20
+    assert lines[1].startswith("repetitive-texture ((193, 229),) 2.3")
+    assert lines[-1].startswith("NOT_RIGID (2, 33, 33) [[")
+    assert 193 <= int(lines[-2]) <= 229
 
 
 def test_the_scenario_on_the_page_of_simulation_is_one(tmp_path: Path) -> None:
