@@ -77,10 +77,13 @@ def test_a_bad_log_gives_what_can_be_read_and_says_what_is_lost(
 
 
 MEASURED = """
-import json, resource, sys, time
+import json, re, sys, time
 from pathlib import Path
 from readers import open_recording
 from readers.streams import RecordingError
+def peak_mib():  # of this program alone: getrusage also counts what the parent had when it started this one
+    status = Path("/proc/self/status").read_text()
+    return int(re.search(r"VmHWM:\\s+(\\d+) kB", status).group(1)) // 1024
 for path in sys.argv[1:]:
     began = time.monotonic()
     try:
@@ -88,11 +91,11 @@ for path in sys.argv[1:]:
             count = sum(1 for _ in recording.messages())
     except RecordingError:
         count = 0
-    peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss // 1024
-    print(json.dumps([path, count, time.monotonic() - began, peak]))
+    print(json.dumps([path, count, time.monotonic() - began, peak_mib()]))
 """
 
 
+@pytest.mark.skipif(not Path("/proc/self/status").is_file(), reason="the memory of a process is read from /proc")
 def test_no_bad_log_costs_much_time_or_memory(tmp_path: Path) -> None:
     paths = []
     for number, case in enumerate(CASES.values()):

@@ -487,7 +487,9 @@ def test_an_interrupt_ends_with_status_130_and_whole_files(tmp_path: Path, numbe
     assert steps[-1].startswith("finish")
     assert not (folder / "sensors.toml").exists()
     checks = manifest.verify(folder, "best", toy_rows)
-    assert {check.name for check in checks} == {"best.rrd", "best.toml", "best.tum", "sensors.rrd"}
+    assert {check.name for check in checks} == {
+        "best.rrd", "best.toml", "best.tum", "best.checkpoints", "sensors.rrd",
+    }  # fmt: skip
     assert not any(check.problems for check in checks)
 
 

@@ -417,7 +417,7 @@ def test_samples_of_another_recording_or_window_are_refused(walked: dict[str, Pa
     record.write_text(text.replace("stride = 1", "stride = 2"))
     with pytest.raises(RecordingError, match="another window, stream"):
         ask(Question(run=folder / "best.rrd"))
-    with pytest.raises(RecordingError, match=r"holds 2 runs: best, paper-a; name one"):
+    with pytest.raises(RecordingError, match=r"holds several runs: best, paper-a; give one"):
         ask(Question(run=folder))
 
 
