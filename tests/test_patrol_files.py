@@ -1,11 +1,13 @@
 """Footprints and coverage against a projecting camera; areas, exports and plans read back; the commands."""
 
+import base64
 import json
 import math
 import re
 from pathlib import Path
 from xml.etree import ElementTree
 
+import cv2
 import numpy as np
 import pytest
 import shapely
@@ -26,6 +28,7 @@ from readers.streams import RecordingError
 from workbench import rrd_reading
 from workbench.cli import main
 from workbench.patrol import areas, exports, saved
+from workbench.patrol.colours import UNSEEN
 from workbench.settings import SettingsError
 
 HERE = Origin.of_degrees(30.17122333, -98.08999167, 265.0)
@@ -300,6 +303,16 @@ def test_a_real_flight_is_mapped(tmp_path: Path, capsys: pytest.CaptureFixture[s
     assert np.median(overlap.values) == pytest.approx(found["forward_overlap"]["median"])
     entities = {chunk.entity_path for chunk in rrd_reading.chunks(log, "/world/**", is_static=None)}
     assert {"/world/coverage/times", "/world/coverage/resolution", "/world/flown", "/world/footprint"} <= entities
+    shown = (tmp_path / "evaluation.html").read_text(encoding="utf-8")
+    assert "http" not in re.sub(r"http-equiv", "", shown)  # it asks nothing of any network
+    maps = [base64.b64decode(text) for text in re.findall(r"data:image/png;base64,([^\"]+)", shown)]
+    times = cv2.imdecode(np.frombuffer(maps[0], np.uint8), cv2.IMREAD_COLOR)
+    seen = float((times != np.array(UNSEEN[::-1])).any(axis=2).mean())
+    rows, columns = times.shape[:2]
+    size = re.search(r"(\d+) x (\d+) m;", shown)
+    assert size is not None
+    assert seen * int(size[1]) * int(size[2]) == pytest.approx(found["seen_m2"], rel=0.02)
+    assert rows / columns == pytest.approx(int(size[2]) / int(size[1]), rel=0.01)
 
 
 @pytest.mark.parametrize(

@@ -227,7 +227,7 @@ def evaluate(
 ) -> None:
     """Map what a recorded flight has seen: how often, how finely, and what not; and hold it against a plan.
 
-    The folder gets coverage.rrd (for view) and evaluation.json.
+    The folder gets coverage.rrd (for view), evaluation.html and evaluation.json.
     """
     from readers.streams import ReadOptions
     from workbench.patrol import areas, evaluating, reporting, saved

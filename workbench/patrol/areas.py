@@ -18,6 +18,7 @@ import numpy as np
 import shapely
 from numpy.typing import NDArray
 from shapely.geometry import MultiPolygon, Polygon
+from shapely.geometry.base import BaseGeometry
 
 from pipelines.patrol.area import Area, parts, polygon_of
 from pipelines.patrol.place import Origin
@@ -220,3 +221,8 @@ def polygons_of(shape: Polygon | MultiPolygon) -> Iterator[list[Floats]]:
     """The borders [n, 2] of each polygon, the outer one first, closed."""
     for part in parts(shape):
         yield [np.array(ring.coords) for ring in (part.exterior, *part.interiors)]
+
+
+def rings_of(shape: BaseGeometry) -> list[Floats]:
+    """The outlines [m, 2] of a shape, holes included."""
+    return [ring for rings in polygons_of(shape) for ring in rings]

@@ -9,27 +9,30 @@ from pathlib import Path
 from typing import Any
 
 from readers.streams import RecordingError
+from workbench.patrol import page
 from workbench.patrol.evaluating import Evaluation
 from workbench.summary import without_nan
 
 
 def write(done: Evaluation, values: Mapping[str, Any], folder: Path) -> list[Path]:
-    """Write evaluation.json and coverage.rrd; returns them.
+    """Write evaluation.json, evaluation.html and coverage.rrd; returns them.
 
     Raises:
         RecordingError: they cannot be written.
     """
     from workbench.patrol import rrd_patrol
 
-    report = folder / "evaluation.json"
+    report, shown = folder / "evaluation.json", folder / "evaluation.html"
+    told = sentences(values)
     try:
         folder.mkdir(parents=True, exist_ok=True)
         report.write_text(json.dumps(without_nan(values), indent=1, allow_nan=False) + "\n", encoding="utf-8")
+        shown.write_text(page.html(f"Coverage of {folder.name}", done, values, told), encoding="utf-8")
     except OSError as error:
         problem = f"no results can be written there ({error.strerror or error})"
         raise RecordingError(folder, problem, "choose another folder with -o") from error
-    lines = ["# What the flight has seen", "", *(f"- {line}" for line in sentences(values))]
-    return [report, rrd_patrol.write_flight(folder / "coverage.rrd", done, "\n".join(lines))]
+    lines = ["# What the flight has seen", "", *(f"- {line}" for line in told)]
+    return [report, shown, rrd_patrol.write_flight(folder / "coverage.rrd", done, "\n".join(lines))]
 
 
 def sentences(values: Mapping[str, Any]) -> list[str]:

@@ -3,11 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-import cv2
 import numpy as np
 import rerun as rr
 import rerun.blueprint as rrb
@@ -17,7 +15,8 @@ from shapely.geometry.base import BaseGeometry
 from pipelines.patrol.coverage import Coverage
 from pipelines.patrol.plan import Plan
 from workbench.blueprints import Extent, ground_view
-from workbench.patrol.areas import polygons_of
+from workbench.patrol.areas import rings_of
+from workbench.patrol.colours import Scale
 from workbench.patrol.evaluating import Evaluation
 from workbench.rrd_file import RrdFile, document
 
@@ -29,24 +28,7 @@ COLOURS = {
 }  # fmt: skip
 HEIGHTS = {"coverage": 0.0, "area": 0.02, "gap": 0.03, "plan": 0.04, "flown": 0.05, "footprint": 0.06}
 """Heights of the layers of the map in shares of 1 % of its size, so that none flickers through another."""
-UNSEEN = (18, 20, 24)
 PLAN_MS = 1_000_000_000
-
-
-@dataclass(frozen=True, slots=True)
-class Scale:
-    """A scale of colours: from `low`, blue, to `high`, yellow."""
-
-    low: float
-    high: float
-
-    def colours(self, numbers: Floats) -> NDArray[np.uint8]:
-        """RGB [rows, columns, 3]; where NaN, the background."""
-        share = np.clip((numbers - self.low) / max(self.high - self.low, 1e-12), 0, 1)
-        grey = np.nan_to_num(share * 255).astype(np.uint8)
-        rgb = cv2.cvtColor(cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS), cv2.COLOR_BGR2RGB)
-        rgb[~np.isfinite(numbers)] = UNSEEN
-        return np.asarray(rgb, dtype=np.uint8)
 
 
 def write_plan(path: Path, plan: Plan, text: str) -> Path:
@@ -70,13 +52,13 @@ def write_flight(path: Path, done: Evaluation, text: str) -> Path:
     corners = [found.middles.reshape(-1, 2)[[0, -1]]]
     corners += [_corners(done.target)] if done.target is not None else []
     extent = Extent.of(np.concatenate(corners))
-    count = Scale(0.0, max(float(np.quantile(found.count[found.count > 0], 0.99)), 2.0))
+    count = Scale.of_counts(found.count)
     finest = found.best_m[np.isfinite(found.best_m)]
     sheets = ["times"]
     _sheet(file, "times", found, count.colours(np.where(found.count > 0, found.count, np.nan)))
     maps = [_view(sheets[0], extent, f"Times seen: 1 (blue) to {count.high:.0f} (yellow)", ["resolution"])]
     if len(finest):
-        fine = Scale(*np.quantile(finest, [0.01, 0.99]).tolist())
+        fine = Scale.of_sizes(finest)
         _sheet(file, "resolution", found, fine.colours(found.best_m))
         low, high = fine.low * 100, fine.high * 100
         maps.append(
@@ -85,8 +67,8 @@ def write_flight(path: Path, done: Evaluation, text: str) -> Path:
     if done.plan is not None:
         _plan(file, done.plan, extent)
     elif done.target is not None:
-        _outlines(file, "/world/area", _rings(done.target), "area", HEIGHTS["area"], extent)
-    _outlines(file, "/world/gaps", [r for gap in done.gaps for r in _rings(gap)], "gap", HEIGHTS["gap"], extent)
+        _outlines(file, "/world/area", rings_of(done.target), "area", HEIGHTS["area"], extent)
+    _outlines(file, "/world/gaps", [r for gap in done.gaps for r in rings_of(gap)], "gap", HEIGHTS["gap"], extent)
     _flown(file, done, extent)
     file.static("/patrol/account", document(text))
     file.scale_bar(extent)
@@ -121,8 +103,10 @@ def _layer(points: Floats, height: float, extent: Extent) -> NDArray[np.float32]
 
 def _plan(file: RrdFile, plan: Plan, extent: Extent) -> None:
     area = plan.task.area
-    _outlines(file, "/world/area", _rings(area.polygon), "area", HEIGHTS["area"], extent)
-    _outlines(file, "/world/no_go", [r for zone in area.no_go for r in _rings(zone)], "no_go", HEIGHTS["area"], extent)
+    _outlines(file, "/world/area", rings_of(area.polygon), "area", HEIGHTS["area"], extent)
+    _outlines(
+        file, "/world/no_go", [r for zone in area.no_go for r in rings_of(zone)], "no_go", HEIGHTS["area"], extent
+    )
     for number, flight in enumerate(plan.flights, 1):
         for name, sweeping in (("pass", True), ("way", False)):
             lines = [leg.points for leg in flight.legs if leg.sweeping is sweeping]
@@ -136,10 +120,6 @@ def _outlines(file: RrdFile, entity: str, lines: Iterable[Floats], colour: str, 
     strips = [_layer(line, height, extent) for line in lines]
     if strips:
         file.static(entity, rr.LineStrips3D(strips, colors=COLOURS[colour], radii=rr.Radius.ui_points(1.5)))
-
-
-def _rings(shape: BaseGeometry) -> list[Floats]:
-    return [ring for rings in polygons_of(shape) for ring in rings]
 
 
 def _corners(shape: BaseGeometry) -> Floats:

@@ -33,9 +33,21 @@ WORDS = {Severity.FINE: "fine", Severity.NOTICE: "notice", Severity.WARNING: "wa
 
 def html(facts: Facts, pictures: Mapping[int, Picture]) -> str:
     """The page of a run, with the pictures of some frames."""
-    style, script = (resources.files(__package__).joinpath(f"page.{kind}").read_text("utf-8") for kind in ("css", "js"))
-    sections = [section for section in _sections(facts, pictures) if section is not None]
+    sections = [one for one in _sections(facts, pictures) if one is not None]
     spans = json.dumps([[f.rule, [list(span) for span in f.spans]] for f in facts.findings], separators=(",", ":"))
+    return framed(facts.title, "report of a run", sections, spans)
+
+
+def framed(title: str, kind: str, sections: Sequence[Element], findings: str = "[]") -> str:
+    """A whole page: head, table of contents, sections.
+
+    Args:
+        title: of the page.
+        kind: what it is a page of.
+        sections: of `section`.
+        findings: the spans of frames that plots shade, as JSON.
+    """
+    style, script = (resources.files(__package__).joinpath(f"page.{end}").read_text("utf-8") for end in ("css", "js"))
     root = el(
         "html",
         el(
@@ -44,18 +56,18 @@ def html(facts: Facts, pictures: Mapping[int, Picture]) -> str:
             el("meta", http_equiv="Content-Security-Policy", content=_policy(style, script)),
             el("meta", name="viewport", content="width=device-width, initial-scale=1"),
             el("meta", name="color-scheme", content="light dark"),
-            el("title", facts.title),
+            el("title", title),
             el("style", style),
         ),
         el(
             "body",
-            el("a", "Skip to the report", href="#verdict", class_="skip"),
-            el("header", el("p", "Estimator workbench: report of a run", class_="kind"), el("h1", facts.title)),
+            el("a", "Skip to the report", href=f"#{sections[0].get('id')}", class_="skip"),
+            el("header", el("p", f"Estimator workbench: {kind}", class_="kind"), el("h1", title)),
             el("nav", el("ul", [el("li", el("a", _heading(s), href=f"#{s.get('id')}")) for s in sections]),
                aria_label="Contents"),
             el("main", sections),
             el("script", script),
-            data_findings=spans,
+            data_findings=findings,
         ),
         lang="en",
     )  # fmt: skip
@@ -80,7 +92,8 @@ def _heading(section: Element) -> str:
     return found.text or ""
 
 
-def _section(key: str, title: str, *content: Content) -> Element:
+def section(key: str, title: str, *content: Content) -> Element:
+    """A section with its heading."""
     return el("section", el("h2", title, id=f"{key}-title"), *content, id=key, aria_labelledby=f"{key}-title")
 
 
@@ -94,7 +107,7 @@ def _sections(facts: Facts, pictures: Mapping[int, Picture]) -> list[Element | N
         _findings(facts, pictures),
         _drift(facts),
         _metrics(facts),
-        _section("verdicts", "Verdicts of the frames", _counts("Verdicts", facts.verdicts),
+        section("verdicts", "Verdicts of the frames", _counts("Verdicts", facts.verdicts),
                  _counts("Alarms (a frame can have several)", facts.alarms)),
         _estimator(facts, others),
         _run(facts),
@@ -112,12 +125,12 @@ def _verdict(facts: Facts, errors: Sequence[Chart]) -> Element:
     known = any(math.isfinite(f.harm_m) for f in facts.findings) or not facts.findings
     first = [_card(k, f) for k, f in enumerate(facts.findings[:FIRST])]
     found: Content = el("ol", first, class_="cards") if first else el("p", "The diagnosis found nothing.")
-    return _section(
+    return section(
         "verdict",
         "Verdict",
         el("p", el("strong", WORDS[facts.gravity], class_=f"badge {WORDS[facts.gravity]}"), " ", facts.upshot,
            class_="upshot"),
-        _list(facts.advice[1:]),
+        listed(facts.advice[1:]),
         el("h3", "What did the most harm" if known else "The gravest findings"),
         found,
         el("p", "Plots: hover, or focus one and use the arrow keys (with Shift ten points, Home and End). Frames of "
@@ -140,13 +153,13 @@ def _card(place: int, finding: Finding) -> Element:
 
 
 def _missing(facts: Facts) -> Element | None:
-    return _section("missing", "What this report cannot tell", _list(facts.missing)) if facts.missing else None
+    return section("missing", "What this report cannot tell", listed(facts.missing)) if facts.missing else None
 
 
 def _path(facts: Facts, errors: Sequence[Chart]) -> Element | None:
     figures = [] if facts.ways is None else [plots.ways_plot(facts.ways, facts.findings)]
     figures += [plots.chart_plot(chart, facts.findings) for chart in errors[1:]]
-    return _section("path", "Path", figures) if figures else None
+    return section("path", "Path", figures) if figures else None
 
 
 # ------------------------------------------------------------------------------------ findings
@@ -154,8 +167,8 @@ def _path(facts: Facts, errors: Sequence[Chart]) -> Element | None:
 
 def _findings(facts: Facts, pictures: Mapping[int, Picture]) -> Element:
     if not facts.findings:
-        return _section("findings", "Findings", el("p", "The diagnosis found nothing in this run."))
-    table = _table(
+        return section("findings", "Findings", el("p", "The diagnosis found nothing in this run."))
+    rows = table(
         "Findings, those that did the most harm first, then the gravest",
         ("#", "finding", "severity", "frames", "worst frame", "harm"),
         [
@@ -168,7 +181,7 @@ def _findings(facts: Facts, pictures: Mapping[int, Picture]) -> Element:
     details = [_finding(facts, k, f, pictures.get(f.worst_frame)) for k, f in enumerate(facts.findings[:DETAILED])]
     rest = len(facts.findings) - len(details)
     more = el("p", f"{rest} more are only in the table; workbench explain shows each.") if rest > 0 else None
-    return _section("findings", "Findings", table, details, more)
+    return section("findings", "Findings", rows, details, more)
 
 
 def _finding(facts: Facts, place: int, finding: Finding, picture: Picture | None) -> Element:
@@ -206,7 +219,7 @@ def _evidence(evidence: Sequence[Evidence]) -> Element | None:
         (e.name, _number(e.value), _number(e.usual), _number(e.bound), "" if e.unit == "1" else e.unit)
         for e in evidence
     ]
-    return _table("Evidence at the worst frame", ("what", "there", "usual", "bound", "unit"), rows, right=(1, 2, 3))
+    return table("Evidence at the worst frame", ("what", "there", "usual", "bound", "unit"), rows, right=(1, 2, 3))
 
 
 def _pictures(picture: Picture | None) -> Element | None:
@@ -215,8 +228,8 @@ def _pictures(picture: Picture | None) -> Element | None:
     parts = ((picture.image, picture.caption), (picture.closer, picture.closer_caption))
     figures = [el("figure", drawing, el("figcaption", text)) for drawing, text in parts if text]
     columns = range(1, len(picture.heads))
-    table = _table(f"Numbers of frame {picture.frame}", picture.heads, picture.rows, columns) if picture.rows else None
-    return el("div", el("div", figures, class_="pictures"), table)
+    rows = table(f"Numbers of frame {picture.frame}", picture.heads, picture.rows, columns) if picture.rows else None
+    return el("div", el("div", figures, class_="pictures"), rows)
 
 
 # ------------------------------------------------------------------------------------ numbers
@@ -235,7 +248,7 @@ def _drift(facts: Facts) -> Element | None:
         f"The end is {length(budget.end_error_m)} off: {length(float(np.nansum(budget.shift_m)))} by wrong shifts, "
         f"{length(float(np.nansum(budget.heading_m)))} by wrong turns carried to the end. {budget.about}"
     )
-    return _section("drift", "Drift budget", el("p", told), plots.chart_plot(chart, facts.findings),
+    return section("drift", "Drift budget", el("p", told), plots.chart_plot(chart, facts.findings),
                     _worst(facts, budget))  # fmt: skip
 
 
@@ -249,13 +262,13 @@ def _worst(facts: Facts, budget: Drift) -> Element:
         parts = (float(part[row]) for part in (budget.harm_m, budget.shift_m, budget.heading_m))
         rows.append((str(frame), *(length(part) for part in parts), facts.run.verdicts[row].name or "OK", by))
     heads = ("frame", "harm", "by shift", "by heading", "verdict", "finding")
-    return _table("Frames that did the most harm", heads, rows, right=(0, 1, 2, 3))
+    return table("Frames that did the most harm", heads, rows, right=(0, 1, 2, 3))
 
 
 def _metrics(facts: Facts) -> Element | None:
     if not facts.metrics:
         return None
-    return _section("metrics", "Metrics", _table("Evaluation", *metric_rows(facts.metrics), right=range(1, 6)))
+    return section("metrics", "Metrics", table("Evaluation", *metric_rows(facts.metrics), right=range(1, 6)))
 
 
 def metric_rows(metrics: Sequence[Metric]) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
@@ -275,12 +288,12 @@ def _counts(title: str, counted: Sequence[Counted]) -> Element:
     if not counted:
         return el("p", f"{title.partition(' ')[0]}: none.")
     rows = [(c.name, str(c.frames), WORDS[c.severity], c.sentence) for c in counted]
-    return _table(title, ("name", "frames", "severity", "what it says"), rows, right=(1,))
+    return table(title, ("name", "frames", "severity", "what it says"), rows, right=(1,))
 
 
 def _estimator(facts: Facts, charts: Sequence[Chart]) -> Element | None:
     figures = [plots.chart_plot(chart, facts.findings) for chart in charts]
-    return _section("estimator", "What the estimator computed", figures) if figures else None
+    return section("estimator", "What the estimator computed", figures) if figures else None
 
 
 # ------------------------------------------------------------------------------------ where it comes from
@@ -288,42 +301,45 @@ def _estimator(facts: Facts, charts: Sequence[Chart]) -> Element | None:
 
 def _run(facts: Facts) -> Element:
     rows = [(el("dt", name), el("dd", text)) for name, text in facts.about]
-    return _section("run", "Mission and run", el("dl", rows), _list(facts.notes))
+    return section("run", "Mission and run", el("dl", rows), listed(facts.notes))
 
 
 def _settings(facts: Facts) -> Element:
     title, preset = "Changed settings", facts.run.preset
     if not facts.settings:
-        return _section("settings", title, el("p", f"All settings are those of the preset {preset}."))
-    table = _table(f"Settings that differ from the preset {preset}", ("setting", "here", "preset"), facts.settings)
-    return _section("settings", title, table)
+        return section("settings", title, el("p", f"All settings are those of the preset {preset}."))
+    rows = table(f"Settings that differ from the preset {preset}", ("setting", "here", "preset"), facts.settings)
+    return section("settings", title, rows)
 
 
 def _recording(facts: Facts) -> Element:
     unknown = "" if facts.run.summary else "Not known: the replay did not come to its end."
-    damage: Content = _list(facts.damage) or el("p", unknown or "No damage was found in what was read.")
-    oddities: Content = _list(facts.oddities) or el("p", unknown or "Nothing odd was found about clocks and streams.")
-    return _section("recording", "Damage and clocks", el("h3", "Damage"), damage, el("h3", "Clocks and streams"),
+    damage: Content = listed(facts.damage) or el("p", unknown or "No damage was found in what was read.")
+    oddities: Content = listed(facts.oddities) or el("p", unknown or "Nothing odd was found about clocks and streams.")
+    return section("recording", "Damage and clocks", el("h3", "Damage"), damage, el("h3", "Clocks and streams"),
                     oddities)  # fmt: skip
 
 
 def _versions(facts: Facts) -> Element:
-    return _section(
+    return section(
         "versions",
         "Versions and digests",
-        _table("Versions", ("what", "version"), facts.versions),
-        _table("SHA-256", ("file", "size", "digest"), [(n, s, el("code", d)) for n, s, d in facts.digests], right=(1,)),
+        table("Versions", ("what", "version"), facts.versions),
+        table("SHA-256", ("file", "size", "digest"), [(n, s, el("code", d)) for n, s, d in facts.digests], right=(1,)),
     )
 
 
 # ------------------------------------------------------------------------------------ parts
 
 
-def _list(texts: Sequence[str]) -> Element | None:
+def listed(texts: Sequence[str]) -> Element | None:
+    """Texts as a list, None of none."""
     return el("ul", [el("li", text) for text in texts]) if texts else None
 
 
-def _table(caption: str, heads: Sequence[str], rows: Sequence[Sequence[Content]], right: Sequence[int] = ()) -> Element:
+def table(caption: str, heads: Sequence[str], rows: Sequence[Sequence[Content]], right: Sequence[int] = ()) -> Element:
+    """A table; the first cell of a row is its heading, the columns `right` hold numbers."""
+
     def kind(k: int) -> str | None:
         return "number" if k in right else None
 
