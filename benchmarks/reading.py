@@ -133,7 +133,7 @@ def decompression(path: Path) -> Work:
         body = view[block.offset + HEAD.size : block.offset + block.size]
         head = read_chunk_head(body)
         packed.append((head.compression, body[head.start : head.stop], head.unpacked_bytes))
-    zstd, lz4_frame = zstandard.ZstdDecompressor(), lz4.frame.LZ4FrameDecompressor()
+    zstd = zstandard.ZstdDecompressor()
 
     def unpack() -> int:
         total = 0
@@ -141,8 +141,8 @@ def decompression(path: Path) -> Work:
             if compression == "zstd":
                 total += len(zstd.decompress(data))
             elif compression == "lz4":
-                lz4_frame.reset()
-                total += len(lz4_frame.decompress(data, max_length=size + 1))
+                context = lz4.frame.create_decompression_context()
+                total += len(lz4.frame.decompress_chunk(context, data, max_length=size)[0])
         return total
 
     return unpack
