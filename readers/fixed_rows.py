@@ -98,13 +98,15 @@ def _is_unit(quat: FloatArray) -> NDArray[np.bool_]:
     """Which of the quaternions [N, 4] are certainly of unit norm, within the tolerance."""
     with np.errstate(all="ignore"):
         squares = np.einsum("ij,ij->i", quat, quat)
-        return np.abs(squares - 1.0) < NORM_TOLERANCE  # half the tolerance of the norm
+        unit: NDArray[np.bool_] = np.abs(squares - 1.0) < NORM_TOLERANCE  # half the tolerance of the norm
+    return unit
 
 
 def _plain_imu(n: FloatArray) -> NDArray[np.bool_]:
     measured = (n[:, 16] != -1.0) & (n[:, 28] != -1.0)
     oriented = _is_unit(n[:, :4]) & (n[:, 3] != 1.0)  # one that is exactly the identity may mean nothing
-    return measured & ((n[:, 4] == -1.0) | oriented)
+    plain: NDArray[np.bool_] = measured & ((n[:, 4] == -1.0) | oriented)
+    return plain
 
 
 def _imu_columns(n: FloatArray) -> Columns:

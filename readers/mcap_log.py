@@ -16,6 +16,7 @@ from types import MappingProxyType
 
 import numpy as np
 
+from readers.ahead import WORTH_A_THREAD_S
 from readers.mcap_records import (
     FOOTER,
     HEAD,
@@ -51,7 +52,6 @@ KEPT_BLOCKS = 4
 KEPT_BYTES = 1 << 24
 SHORT_READ = 8  # blocks; for so few no thread is started
 WORTH_A_THREAD_BYTES = {"zstd": 1 << 16, "lz4": 1 << 23}  # lz4 unpacks about as fast as a thread is woken
-WORTH_A_THREAD_S = 2e-3  # of work on one block, during which the next one can be unpacked
 _DEFAULT_ENCODING = {"ros1": "ros1", "ros2": "cdr"}
 
 
