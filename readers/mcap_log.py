@@ -11,6 +11,7 @@ import time
 from collections import OrderedDict
 from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
@@ -48,7 +49,7 @@ from readers.salvage import Cause, Loss, Tally
 from readers.streams import RecordingError
 
 READ_AHEAD = 2
-KEPT_BLOCKS = 4
+KEPT_BLOCKS = 2
 KEPT_BYTES = 1 << 24
 SHORT_READ = 8  # blocks; for so few no thread is started
 WORTH_A_THREAD_BYTES = {"zstd": 1 << 16, "lz4": 1 << 23}  # lz4 unpacks about as fast as a thread is woken
@@ -318,11 +319,11 @@ class McapLog(IndexedLog):
             self._checked.add(block.offset)
         return found
 
-    def _load(self, block: McapBlock, ahead: Collection[McapBlock] = ()) -> Unpacked:
+    def _load(self, block: McapBlock, ahead: Collection[McapBlock] = (), *, keep: bool = True) -> Unpacked:
         """The records of a block; those that will be asked for next are unpacked in a thread where that saves time.
 
-        It saves none where the messages are passed on sooner than a thread wakes. A block that is read `ahead` of
-        others is not kept.
+        It saves none where the messages are passed on sooner than a thread wakes. Blocks are kept for a second look
+        only where a reading begins: memory that is free again is taken again, which is quicker than new memory.
         """
         future = self._unpacked.get(block.offset)
         small = block.memory_bytes * KEPT_BLOCKS <= KEPT_BYTES
@@ -335,7 +336,7 @@ class McapLog(IndexedLog):
             self._unpacked[block.offset] = future
         self._unpacked.move_to_end(block.offset)
         unpacked = future.result()
-        kept = 1 + begun if ahead else KEPT_BLOCKS if small else 1
+        kept = KEPT_BLOCKS if keep and small else 1 + begun
         while len(self._unpacked) > kept:
             self._unpacked.popitem(last=False)
         self._given_s = time.perf_counter()
@@ -357,7 +358,7 @@ class McapLog(IndexedLog):
     def _select(
         self, block: Block, channels: Collection[Channel], start_ns: int | None, stop_ns: int | None
     ) -> Iterator[Message]:
-        return self._chosen(block, (), channels, start_ns, stop_ns)
+        return self._chosen(block, (), channels, start_ns, stop_ns, keep=True)
 
     def _chosen(
         self,
@@ -366,9 +367,11 @@ class McapLog(IndexedLog):
         channels: Collection[Channel],
         start_ns: int | None,
         stop_ns: int | None,
+        *,
+        keep: bool,
     ) -> Iterator[Message]:
         assert isinstance(block, McapBlock)
-        unpacked = self._load(block, ahead)
+        unpacked = self._load(block, ahead, keep=keep)
         if unpacked.withheld:
             return iter(())
         wanted = {number: channel for number, channel in block.segment.channels.items() if channel in channels}
@@ -409,9 +412,7 @@ class McapLog(IndexedLog):
         for place, block in enumerate(blocks):
             ahead = blocks[place + 1 : place + 1 + READ_AHEAD] if place >= SHORT_READ else ()
 
-            def open_it(block: McapBlock = block, ahead: Collection[McapBlock] = ahead) -> Iterator[Message]:
-                return self._chosen(block, ahead, wanted, start_ns, stop_ns)
-
+            open_it = partial(self._chosen, block, ahead, wanted, start_ns, stop_ns, keep=place == 0)
             yield Source(block.first_ns, open_it, block.last_ns)
 
     def add_block(self, block: McapBlock) -> None:
