@@ -49,7 +49,7 @@ from readers.salvage import Cause, Loss, Tally
 from readers.streams import RecordingError
 
 READ_AHEAD = 2
-KEPT_BLOCKS = 2
+KEPT_BLOCKS = 4
 KEPT_BYTES = 1 << 24
 SHORT_READ = 8  # blocks; for so few no thread is started
 WORTH_A_THREAD_BYTES = {"zstd": 1 << 16, "lz4": 1 << 23}  # lz4 unpacks about as fast as a thread is woken
@@ -323,7 +323,7 @@ class McapLog(IndexedLog):
         """The records of a block; those that will be asked for next are unpacked in a thread where that saves time.
 
         It saves none where the messages are passed on sooner than a thread wakes. Blocks are kept for a second look
-        only where a reading begins: memory that is free again is taken again, which is quicker than new memory.
+        only at the begin of the log: memory that is free again is taken again, which is quicker than new memory.
         """
         future = self._unpacked.get(block.offset)
         small = block.memory_bytes * KEPT_BLOCKS <= KEPT_BYTES
@@ -412,7 +412,9 @@ class McapLog(IndexedLog):
         for place, block in enumerate(blocks):
             ahead = blocks[place + 1 : place + 1 + READ_AHEAD] if place >= SHORT_READ else ()
 
-            open_it = partial(self._chosen, block, ahead, wanted, start_ns, stop_ns, keep=place == 0)
+            open_it = partial(
+                self._chosen, block, ahead, wanted, start_ns, stop_ns, keep=start_ns is None and place < KEPT_BLOCKS
+            )
             yield Source(block.first_ns, open_it, block.last_ns)
 
     def add_block(self, block: McapBlock) -> None:
