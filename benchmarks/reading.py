@@ -110,10 +110,17 @@ def own_samples(path: Path) -> int:
         return drain(recording.read(["/image", "/imu"]))
 
 
-def peer_raw(path: Path, topics: tuple[str, ...] = (), start_ns: int | None = None, stop_ns: int | None = None) -> int:
+def peer_raw(
+    path: Path,
+    topics: tuple[str, ...] = (),
+    start_ns: int | None = None,
+    stop_ns: int | None = None,
+    *,
+    check: bool = False,
+) -> int:
     """The same with `mcap`, which does not compare checksums unless it is told to."""
     with path.open("rb") as file:
-        reader = make_reader(file)
+        reader = make_reader(file, validate_crcs=check)
         return drain(reader.iter_messages(list(topics) or None, start_time=start_ns, end_time=stop_ns))
 
 
@@ -133,7 +140,7 @@ def decompression(path: Path) -> Work:
         body = view[block.offset + HEAD.size : block.offset + block.size]
         head = read_chunk_head(body)
         packed.append((head.compression, body[head.start : head.stop], head.unpacked_bytes))
-    zstd, lz4_frame = zstandard.ZstdDecompressor(), lz4.frame.LZ4FrameDecompressor()
+    zstd = zstandard.ZstdDecompressor()
 
     def unpack() -> int:
         total = 0
@@ -141,8 +148,8 @@ def decompression(path: Path) -> Work:
             if compression == "zstd":
                 total += len(zstd.decompress(data))
             elif compression == "lz4":
-                lz4_frame.reset()
-                total += len(lz4_frame.decompress(data, max_length=size + 1))
+                context = lz4.frame.create_decompression_context()
+                total += len(lz4.frame.decompress_chunk(context, data, max_length=size)[0])
         return total
 
     return unpack
@@ -201,6 +208,7 @@ def bars(path: Path, codec: str, seconds: int, passes: int) -> list[tuple[str, f
             "raw": lambda: own_raw(path),
             "imu": lambda: own_raw(path, ("/imu",)),
             "mcap": lambda: peer_raw(path),
+            "mcap checks": lambda: peer_raw(path, check=True),
             "samples": lambda: own_samples(path),
             "rosbags": lambda: rosbags_decoded(path),
             "window": lambda: own_raw(path, *window),
@@ -209,6 +217,7 @@ def bars(path: Path, codec: str, seconds: int, passes: int) -> list[tuple[str, f
         passes,
     )
     rows = [("raw / mcap", found["raw"], found["raw"] / found["mcap"], 0.10 if codec == "none" else float("nan"))]
+    rows.append(("raw / mcap with checksums", found["raw"], found["raw"] / found["mcap checks"], float("nan")))
     if codec != "none":
         rows.append(("raw / decompression", found["raw"], found["raw"] / found["unpack"], 1.35))
     limit = 0.10 if codec == "none" else 0.35

@@ -1,12 +1,14 @@
 """Blocks of a log unpacked in threads, before they are asked for.
 
 zstd, lz4, bz2 and checksums release Python's global lock, so that a few blocks ahead hide their unpacking behind the
-work that is done on the messages; bz2 blocks are unpacked side by side.
+work that is done on the messages; bz2 blocks are unpacked side by side. Where blocks are asked for one right after the
+other there is no such work, and the hand-over to a thread would only cost time.
 """
 
 from __future__ import annotations
 
 import os
+import time
 from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
@@ -17,6 +19,8 @@ Key = TypeVar("Key")
 Value = TypeVar("Value")
 AHEAD_BYTES = 8 << 20
 AHEAD_BLOCKS = 4
+WORTH_A_THREAD_S = 2e-3
+"""Work on one block during which it pays to unpack the next one."""
 
 
 @lru_cache(maxsize=1)
@@ -30,13 +34,17 @@ class Ahead(Generic[Key, Value]):
     Args:
         load: unpacks one block; it runs in a thread, and what it raises comes out of `take`.
         blocks: the keys, each with the bytes that its result takes.
+        pause_s: how long it must take, from one block to the asking for the next one, for others to be begun.
     """
 
-    def __init__(self, load: Callable[[Key], Value], blocks: Iterable[tuple[Key, int]]) -> None:
+    def __init__(
+        self, load: Callable[[Key], Value], blocks: Iterable[tuple[Key, int]], pause_s: float = WORTH_A_THREAD_S
+    ) -> None:
         self._load = load
         self._coming = deque(blocks)
         self._begun: dict[Key, tuple[Future[Value], int]] = {}
-        self._going_on = False
+        self._pause_s = pause_s
+        self._given_s = float("inf")
 
     def take(self, key: Key) -> Value:
         """The result for `key`. From the second key on the next ones are begun: one alone is no reading through."""
@@ -44,10 +52,11 @@ class Ahead(Generic[Key, Value]):
         if future is None:
             while self._coming and self._coming.popleft()[0] is not key:
                 pass
-        if self._going_on:
+        if time.perf_counter() - self._given_s >= self._pause_s:
             self._begin()
-        self._going_on = True
-        return self._load(key) if future is None else future.result()
+        value = self._load(key) if future is None else future.result()
+        self._given_s = time.perf_counter()
+        return value
 
     def _begin(self) -> None:
         while self._coming and len(self._begun) < AHEAD_BLOCKS:

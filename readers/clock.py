@@ -8,9 +8,11 @@ from __future__ import annotations
 import heapq
 import statistics
 from array import array
-from collections import Counter
+from bisect import insort_right
+from collections import Counter, deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
@@ -38,14 +40,17 @@ def reorder(samples: Iterable[Sample], window_ns: int = REORDER_WINDOW_NS, *, la
     that is passed on at once, out of order, and `StreamAudit` counts it. `lag_ns` is by how much the
     log time usually exceeds the stamps: zero unless the sensor's clock is another one.
     """
-    heap: list[tuple[int, int, Sample]] = []
-    for number, sample in enumerate(samples):
-        heapq.heappush(heap, (sample.t_ns, number, sample))
-        horizon = sample.received_ns - lag_ns - window_ns
-        while heap and heap[0][0] <= horizon:
-            yield heapq.heappop(heap)[2]
-    while heap:
-        yield heapq.heappop(heap)[2]
+    waiting: deque[Sample] = deque()  # in order; most samples come in order
+    delay_ns = lag_ns + window_ns
+    for sample in samples:
+        if waiting and sample.t_ns < waiting[-1].t_ns:
+            insort_right(waiting, sample, key=attrgetter("t_ns"))
+        else:
+            waiting.append(sample)
+        horizon = sample.received_ns - delay_ns
+        while waiting and waiting[0].t_ns <= horizon:
+            yield waiting.popleft()
+    yield from waiting
 
 
 def merge(*sources: Iterable[Sample]) -> Iterator[Sample]:

@@ -119,17 +119,16 @@ def _header(data: Buffer) -> tuple[int, int] | None:
     return seconds * 1_000_000_000 + nanoseconds, end
 
 
-def _imu(data: Buffer, arrival: Arrival) -> Sample | None:
+def imu_numbers_at(data: Buffer) -> int | None:
+    """Where the numbers of sensor_msgs/Imu begin; None if they do not fill the rest of the message."""
     if (header := _header(data)) is None:
         return None
     at = header[1] + (4 - header[1]) % 8
-    if at + 8 * _IMU_NUMBERS != len(data):
-        return None
-    n = np.frombuffer(bytes(data[at:]), _FLOAT)  # a copy, which does not keep the chunk, and read-only
-    return imu_sample(arrival, header[0], n[:4], n[4:13], n[13:16], n[16], n[25:28], n[28])
+    return at if at + 8 * _IMU_NUMBERS == len(data) else None
 
 
-def _odometry(data: Buffer, arrival: Arrival) -> Sample | None:
+def odometry_numbers_at(data: Buffer) -> int | None:
+    """Where the numbers of nav_msgs/Odometry begin; None if they do not fill the rest of the message."""
     if (header := _header(data)) is None:
         return None
     at = header[1] + -header[1] % 4
@@ -137,10 +136,26 @@ def _odometry(data: Buffer, arrival: Arrival) -> Sample | None:
         return None
     at += 4 + _U32.unpack_from(data, at)[0]
     at += (4 - at) % 8
-    if at + 8 * _ODOMETRY_NUMBERS != len(data):
+    return at if at + 8 * _ODOMETRY_NUMBERS == len(data) else None
+
+
+def _stamp_ns(data: Buffer) -> int:
+    _, seconds, nanoseconds, _ = _START.unpack_from(data)
+    return int(seconds) * 1_000_000_000 + int(nanoseconds)
+
+
+def _imu(data: Buffer, arrival: Arrival) -> Sample | None:
+    if (at := imu_numbers_at(data)) is None:
+        return None
+    n = np.frombuffer(bytes(data[at:]), _FLOAT)  # a copy, which does not keep the chunk, and read-only
+    return imu_sample(arrival, _stamp_ns(data), n[:4], n[4:13], n[13:16], n[16], n[25:28], n[28])
+
+
+def _odometry(data: Buffer, arrival: Arrival) -> Sample | None:
+    if (at := odometry_numbers_at(data)) is None:
         return None
     n = np.frombuffer(bytes(data[at:]), _FLOAT)
-    return odometry_sample(arrival, header[0], n[:3], n[3:7], n[43:46], n[46:49])
+    return odometry_sample(arrival, _stamp_ns(data), n[:3], n[3:7], n[43:46], n[46:49])
 
 
 def _image(data: Buffer, arrival: Arrival) -> Sample | None:

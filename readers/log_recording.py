@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import itertools
 import statistics
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from pathlib import Path
@@ -20,6 +20,7 @@ import numpy as np
 from readers.clock import REORDER_WINDOW_NS, SECOND_NS, merge, reorder, sane_stamp
 from readers.decoding import Decoder, Definitions, MessageError, decoder_of, definition_text
 from readers.fixed_layout import FixedReader, fixed_reader, header_of
+from readers.fixed_rows import read_rows
 from readers.message_log import Buffer, Channel, Message, MessageLog, Source, in_log_order
 from readers.messages import (
     Arrival,
@@ -50,6 +51,9 @@ from readers.streams import (
 
 SLACK_NS = 2 * SECOND_NS
 FIRST_MESSAGES = 10
+BATCH_BYTES = 1 << 20
+BATCH_MESSAGES = 256
+FEWEST_ROWS = 4
 FRAME_SEARCH_NS = 30 * SECOND_NS
 
 
@@ -108,6 +112,12 @@ class Topic:
             clock=self.clock,
             offset_ns=self.offset_ns,
         )
+
+    def rows(self, messages: Sequence[Message]) -> Sequence[Sample | None]:
+        """The samples of messages of one channel, as far as they can be made together; none, or None, for others."""
+        if messages[0].channel not in self.fixed or not self.trust_stamps or self.clock is not Clock.HEADER:
+            return ()
+        return read_rows(messages, self.name, self.offset_ns)
 
     def samples(self, message: Message) -> Iterator[Sample]:
         """The samples of one message; a `Problem` if it cannot be made into any."""
@@ -393,10 +403,7 @@ class LogRecording(Recording):
             if any(info.name in wanted for info in topic.streams)
             for channel in topic.channels
         }
-        samples = (
-            sample for message in self._messages(by_channel) for sample in by_channel[message.channel].samples(message)
-        )
-        return (sample for sample in samples if sample.stream in wanted)
+        return (sample for sample in _samples(self._messages(by_channel), by_channel) if sample.stream in wanted)
 
     def _wanted(self, streams: Sequence[str] | None) -> frozenset[str]:
         if streams is None:
@@ -429,8 +436,8 @@ class LogRecording(Recording):
             None if start_ns is None else start_ns + low - SLACK_NS,
             None if stop_ns is None else stop_ns + high + SLACK_NS,
         )
-        samples = (sample for message in messages for sample in by_channel[message.channel].samples(message))
-        for sample in reorder((s for s in samples if s.stream in wanted), lag_ns=high):
+        samples = (sample for sample in _samples(messages, by_channel) if sample.stream in wanted)
+        for sample in reorder(samples, lag_ns=high):
             if (start_ns is None or sample.t_ns >= start_ns) and (stop_ns is None or sample.t_ns < stop_ns):
                 yield sample
 
@@ -451,6 +458,35 @@ class LogRecording(Recording):
             log.close()
         if self._scratch is not None:
             self._scratch.cleanup()
+
+
+def _samples(messages: Iterable[Message], by_channel: Mapping[Channel, Topic]) -> Iterator[Sample]:
+    """The samples of messages, in their order; they are decoded together, in batches that end before they are large."""
+    batch: list[Message] = []
+    size = 0
+    for message in messages:
+        batch.append(message)
+        size += len(message.data)
+        if size >= BATCH_BYTES or len(batch) >= BATCH_MESSAGES:
+            yield from _batch_samples(batch, by_channel)
+            batch, size = [], 0
+    yield from _batch_samples(batch, by_channel)
+
+
+def _batch_samples(batch: list[Message], by_channel: Mapping[Channel, Topic]) -> Iterator[Sample]:
+    places: dict[Channel, list[int]] = {}
+    for place, message in enumerate(batch):
+        places.setdefault(message.channel, []).append(place)
+    ready: list[Sample | None] = [None] * len(batch)
+    for channel, own in places.items():
+        if len(own) >= FEWEST_ROWS:
+            for place, sample in zip(own, by_channel[channel].rows([batch[place] for place in own]), strict=False):
+                ready[place] = sample
+    for message, sample in zip(batch, ready, strict=True):
+        if sample is not None:
+            yield sample
+        else:
+            yield from by_channel[message.channel].samples(message)
 
 
 def _decode_late(channel: Channel, data: Buffer) -> Any:

@@ -7,14 +7,17 @@ Chunks are unpacked one at a time, ahead of the reading, and always compared wit
 from __future__ import annotations
 
 import mmap
+import time
 from collections import OrderedDict
 from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
+from functools import partial
 from pathlib import Path
 from types import MappingProxyType
 
 import numpy as np
 
+from readers.ahead import WORTH_A_THREAD_S
 from readers.mcap_records import (
     FOOTER,
     HEAD,
@@ -49,7 +52,7 @@ READ_AHEAD = 2
 KEPT_BLOCKS = 4
 KEPT_BYTES = 1 << 24
 SHORT_READ = 8  # blocks; for so few no thread is started
-WORTH_A_THREAD_BYTES = 1 << 16
+WORTH_A_THREAD_BYTES = {"zstd": 1 << 16, "lz4": 1 << 23}  # lz4 unpacks about as fast as a thread is woken
 _DEFAULT_ENCODING = {"ros1": "ros1", "ros2": "cdr"}
 
 
@@ -72,6 +75,7 @@ class McapLog(IndexedLog):
         self._checked: set[int] = set()
         self.told: set[int] = set()
         self._thread: ThreadPoolExecutor | None = None
+        self._given_s = 0.0
         try:
             self._open()
         except BaseException:
@@ -315,31 +319,46 @@ class McapLog(IndexedLog):
             self._checked.add(block.offset)
         return found
 
-    def _load(self, block: McapBlock, ahead: Collection[McapBlock] = ()) -> Unpacked:
-        """The records of a block; the blocks that will be asked for next are unpacked in a thread meanwhile."""
+    def _load(self, block: McapBlock, ahead: Collection[McapBlock] = (), *, keep: bool = True) -> Unpacked:
+        """The records of a block; those that will be asked for next are unpacked in a thread where that saves time.
+
+        It saves none where the messages are passed on sooner than a thread wakes. Blocks are kept for a second look
+        only at the begin of the log: memory that is free again is taken again, which is quicker than new memory.
+        """
         future = self._unpacked.get(block.offset)
+        small = block.memory_bytes * KEPT_BLOCKS <= KEPT_BYTES
+        begun = 0
+        if small and time.perf_counter() - self._given_s > WORTH_A_THREAD_S:
+            begun = sum(self._begin(following) for following in ahead)
         if future is None:
             future = Future()
             future.set_result(self.unpack(block))
             self._unpacked[block.offset] = future
-        for following in ahead if block.memory_bytes * KEPT_BLOCKS <= KEPT_BYTES else ():
-            if following.offset not in self._unpacked and following.memory_bytes >= WORTH_A_THREAD_BYTES:
-                self._thread = self._thread or ThreadPoolExecutor(1, "unpack")
-                self._unpacked[following.offset] = self._thread.submit(self.unpack, following)
         self._unpacked.move_to_end(block.offset)
         unpacked = future.result()
-        kept = KEPT_BLOCKS if block.memory_bytes * KEPT_BLOCKS <= KEPT_BYTES else 1
+        kept = KEPT_BLOCKS if keep and small else 1 + begun
         while len(self._unpacked) > kept:
             self._unpacked.popitem(last=False)
+        self._given_s = time.perf_counter()
         if unpacked.faults and block.offset not in self.told:
             self.told.add(block.offset)
             self._report_block(block, unpacked)
         return unpacked
 
+    def _begin(self, block: McapBlock) -> bool:
+        """Unpack a block in a thread, where it is worth one; whether that was begun, now or earlier."""
+        if block.offset in self._unpacked:
+            return True
+        if block.memory_bytes < WORTH_A_THREAD_BYTES.get(block.compression, 1 << 16):
+            return False
+        self._thread = self._thread or ThreadPoolExecutor(1, "unpack")
+        self._unpacked[block.offset] = self._thread.submit(self.unpack, block)
+        return True
+
     def _select(
         self, block: Block, channels: Collection[Channel], start_ns: int | None, stop_ns: int | None
     ) -> Iterator[Message]:
-        return self._chosen(block, (), channels, start_ns, stop_ns)
+        return self._chosen(block, (), channels, start_ns, stop_ns, keep=True)
 
     def _chosen(
         self,
@@ -348,9 +367,11 @@ class McapLog(IndexedLog):
         channels: Collection[Channel],
         start_ns: int | None,
         stop_ns: int | None,
+        *,
+        keep: bool,
     ) -> Iterator[Message]:
         assert isinstance(block, McapBlock)
-        unpacked = self._load(block, ahead)
+        unpacked = self._load(block, ahead, keep=keep)
         if unpacked.withheld:
             return iter(())
         wanted = {number: channel for number, channel in block.segment.channels.items() if channel in channels}
@@ -391,9 +412,9 @@ class McapLog(IndexedLog):
         for place, block in enumerate(blocks):
             ahead = blocks[place + 1 : place + 1 + READ_AHEAD] if place >= SHORT_READ else ()
 
-            def open_it(block: McapBlock = block, ahead: Collection[McapBlock] = ahead) -> Iterator[Message]:
-                return self._chosen(block, ahead, wanted, start_ns, stop_ns)
-
+            open_it = partial(
+                self._chosen, block, ahead, wanted, start_ns, stop_ns, keep=start_ns is None and place < KEPT_BLOCKS
+            )
             yield Source(block.first_ns, open_it, block.last_ns)
 
     def add_block(self, block: McapBlock) -> None:

@@ -320,9 +320,14 @@ class McapBlock(Block):
         return replace(self, first_ns=first_ns, last_ns=last_ns, counts=counts)
 
     @property
+    def compression(self) -> str:
+        """How it is compressed, "" where it is not or where that is not stated."""
+        return self.stated.compression if self.stated is not None else ""
+
+    @property
     def memory_bytes(self) -> int:
         """How much memory it takes to unpack it; none where it lies in the file as it is."""
-        return self.stated.unpacked_bytes if self.stated is not None and self.stated.compression else 0
+        return self.stated.unpacked_bytes if self.stated is not None and self.compression else 0
 
 
 @dataclass(slots=True)

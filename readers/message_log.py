@@ -271,13 +271,15 @@ def _unpack(compression: str, data: Buffer, size: int, limit: int, torn: bool) -
     if compression == "bz2":
         return bz2.BZ2Decompressor().decompress(data, min(size, limit) + 1)
     if compression == "lz4":
-        unpacker = lz4.frame.LZ4FrameDecompressor()  # one that met damage goes on to refuse sound data
-        found: bytes = unpacker.decompress(data, max_length=min(size, limit))  # one byte more is ten times as slow
-        if not unpacker.eof and len(found) <= limit and not torn:
-            found += unpacker.decompress(b"", max_length=1)
-            if not unpacker.eof and len(found) <= min(size, limit):
+        context = lz4.frame.create_decompression_context()  # one that met damage goes on to refuse sound data
+        most = min(size, limit)  # one byte more is ten times as slow
+        found, read, whole = lz4.frame.decompress_chunk(context, data, max_length=most)
+        if not whole and len(found) <= limit and not torn:
+            more, _, whole = lz4.frame.decompress_chunk(context, memoryview(data)[read:], max_length=1)
+            found += more
+            if not whole and len(found) <= most:
                 raise EOFError("its end is missing")
-        return found
+        return bytes(found)
     stated = zstandard.frame_content_size(data) if not torn else -1
     if 0 <= stated == size <= limit:
         return _codecs.zstd.decompress(data)

@@ -43,6 +43,7 @@ from readers.streams import (
 )
 
 TRACK_CHANNEL = "id"
+NORM_TOLERANCE = 1e-3
 
 
 class UnsupportedError(MessageError):
@@ -171,7 +172,7 @@ def _unit(quat: FloatArray, arrival: Arrival) -> FloatArray:
     if norm == 0.0:
         arrival.oddities.append("zero_quaternion")
         return UNKNOWN_QUAT
-    if abs(norm - 1.0) > 1e-3:
+    if abs(norm - 1.0) > NORM_TOLERANCE:
         arrival.oddities.append("quaternion_norm")
         return array(*(quat / norm))
     return quat

@@ -10,12 +10,13 @@ from __future__ import annotations
 
 import mmap
 import struct
+from bisect import bisect_left
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from functools import partial
-from itertools import pairwise, permutations
-from operator import itemgetter
+from itertools import islice, permutations
+from operator import gt, itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
 from weakref import WeakSet
@@ -23,7 +24,7 @@ from weakref import WeakSet
 import numpy as np
 from numpy.typing import NDArray
 
-from readers.ahead import Ahead
+from readers.ahead import WORTH_A_THREAD_S, Ahead
 from readers.message_log import Buffer, Channel, DamagedBlockError, Message, MessageLog, Source, inflate, text
 from readers.salvage import Cause, Loss, Tally
 from readers.streams import RecordingError
@@ -38,7 +39,7 @@ _CHUNK_MARK = b"\x04\0\0\0op=\x05"
 _MESSAGE_MARK = b"\x04\0\0\0op=\x02"
 _LONGEST_CHUNK_HEADER = 80
 _LONGEST_HEADER = 1 << 20
-KEPT_CHUNKS, KEPT_CHUNK_BYTES = 8, 1 << 20
+KEPT_CHUNKS, KEPT_CHUNK_BYTES = 4, 1 << 21
 _COMPRESSIONS = (b"none", b"bz2", b"lz4")
 _END_OF_TIME = 1 << 63
 _SECOND_NS = np.uint64(1_000_000_000)
@@ -135,28 +136,39 @@ _FIELDS = {
 _HEADER_BYTES = 38
 
 
-class _Layout:
-    """A message record up to its data, with the header's fields in one order, for one look at all of it."""
+class _Layout(NamedTuple):
+    """A message record up to its data, with the header's fields in one order, for one look at all of it.
 
-    def __init__(self, order: tuple[bytes, ...]) -> None:
-        self._form = struct.Struct("<I" + "".join(_FIELDS[name][0] for name in order) + "I")
+    `marks` takes what is `fixed` out of what `form` unpacks, and `values` the connection, time and length of the data.
+    """
+
+    form: struct.Struct
+    marks: itemgetter[Any]
+    fixed: tuple[Any, ...]
+    values: itemgetter[Any]
+
+    @classmethod
+    def of(cls, order: tuple[bytes, ...]) -> _Layout:
+        """The layout with the fields in that order."""
+        form = struct.Struct("<I" + "".join(_FIELDS[name][0] for name in order) + "I")
         marks, place = {}, 1
         for name in order:
             marks[name] = place
             place += 1 if name == b"op" else 2
-        self._marks = itemgetter(0, *marks.values())
-        self._fixed = (_HEADER_BYTES, *(_FIELDS[name][1] for name in order))
-        self._values = itemgetter(marks[b"conn"] + 1, marks[b"time"] + 1, -1)
-
-    def read(self, data: memoryview, at: int) -> tuple[Any, ...] | None:
-        """Connection, time and length of the data of the message record at `at`; None if there is none such."""
-        if at + _HEADER_BYTES + 8 > len(data):
-            return None
-        head = self._form.unpack_from(data, at)
-        return self._values(head) if self._marks(head) == self._fixed else None
+        fixed = (_HEADER_BYTES, *(_FIELDS[name][1] for name in order))
+        return cls(form, itemgetter(0, *marks.values()), fixed, itemgetter(marks[b"conn"] + 1, marks[b"time"] + 1, -1))
 
 
-_LAYOUTS = [_Layout(order) for order in permutations(_FIELDS)]
+_LAYOUTS = [_Layout.of(order) for order in permutations(_FIELDS)]
+
+
+def layout_at(data: memoryview, at: int) -> _Layout | None:
+    """The layout of the message record at `at`; None if there is none such."""
+    if at + _HEADER_BYTES + 8 > len(data):
+        return None
+    return next((one for one in _LAYOUTS if one.marks(one.form.unpack_from(data, at)) == one.fixed), None)
+
+
 Item = tuple[int, int, memoryview] | Record
 
 
@@ -173,22 +185,24 @@ class Walk:
     def __iter__(self) -> Iterator[Item]:
         """Of a message its connection, time in ns and data; a connection's record as it is."""
         data, at, end = self.data, self.start, len(self.data)
-        layout = _LAYOUTS[0]
+        last_head = end - _HEADER_BYTES - 8
+        form, marks, fixed, values = _LAYOUTS[0]
         while at < end:
-            head = layout.read(data, at)
-            if head is None:
-                layout = next((one for one in _LAYOUTS if one.read(data, at)), layout)
-                head = layout.read(data, at)
-            if head is None:
+            head = form.unpack_from(data, at) if at <= last_head else ()
+            if head and marks(head) != fixed:
+                layout = layout_at(data, at)
+                head = layout.form.unpack_from(data, at) if layout else ()
+                form, marks, fixed, values = layout or _LAYOUTS[0]
+            if head:
+                number, time, length = values(head)
+                start = at + _HEADER_BYTES + 8
+                stop = start + length
+                item: Item = (number, (time & 0xFFFFFFFF) * 1_000_000_000 + (time >> 32), data[start:stop])
+            else:
                 try:
                     item, stop = _any_record(data, at)
                 except TornError:
                     break
-            else:
-                number, time, length = head
-                start = at + _HEADER_BYTES + 8
-                stop = start + length
-                item = (number, (time & 0xFFFFFFFF) * 1_000_000_000 + (time >> 32), data[start:stop])
             if stop > end:
                 break
             self.last, at = at, stop
@@ -220,7 +234,8 @@ class Span(NamedTuple):
     @classmethod
     def of(cls, times_ns: NDArray[np.uint64]) -> Span:
         """The span of at least one log time."""
-        return cls(len(times_ns), int(times_ns.min()), int(times_ns.max()), int(times_ns.sum()))
+        first_ns, last_ns = np.minimum.reduce(times_ns), np.maximum.reduce(times_ns)
+        return cls(len(times_ns), int(first_ns), int(last_ns), int(np.add.reduce(times_ns)))
 
 
 @dataclass(eq=False, slots=True)
@@ -414,7 +429,7 @@ class Ros1Log(MessageLog):
         mark = self._map.find(_MESSAGE_MARK, start, stop)
         while mark >= 0:
             for at in range(max(start, mark - _HEADER_BYTES), mark):
-                if any(layout.read(self._data, at) for layout in _LAYOUTS):
+                if layout_at(self._data, at):
                     fields = {b"compression": b"none", b"size": _U32.pack(min(stop - at, 2**32 - 1))}
                     yield Record(start, _CHUNK, fields, at, stop, torn=True)
                     return
@@ -473,13 +488,14 @@ class Ros1Log(MessageLog):
         """Find out what each chunk holds: from its index where the chunk info agrees, else from itself."""
         for record in records:
             index = index_behind(self._data, record)
-            chunk, own = Chunk(record, index.spans), _ChunkInfo.of(index.spans)
+            spans = index.spans
+            chunk, own = Chunk(record, spans), _ChunkInfo.of(spans)
             info = infos.pop(record.offset, None)
             if info is None and (place := next((p for p, i in infos.items() if i == own), None)) is not None:
                 info = infos.pop(place)
-            believed = info == own if info else bool(index.spans) and index.complete
+            believed = info == own if info else bool(spans) and index.complete
             if record.torn or not believed or not chunk.spans.keys() <= self._by_id.keys():
-                chunk.spans = self._look_into(chunk, index.spans if believed else _announced(info))
+                chunk.spans = self._look_into(chunk, spans if believed else _announced(info))
             if chunk.spans:
                 self._chunks.append(chunk)
         for place, info in infos.items():
@@ -519,7 +535,7 @@ class Ros1Log(MessageLog):
     # ------------------------------------------------------------------------------- messages
 
     def _unpacked(self, chunk: Chunk) -> Buffer:
-        """The records of a chunk; the latest few that were packed are kept, for a second look at the log's begin.
+        """The records of a chunk; the first few that were packed are kept, for a second look at the log's begin.
 
         Raises:
             DamagedBlockError: they cannot be unpacked.
@@ -529,9 +545,7 @@ class Ros1Log(MessageLog):
         record = chunk.record
         packed = self._data[record.start : record.stop]
         data = inflate(text(record.fields[b"compression"]), packed, record.u32(b"size"), torn=record.torn)
-        if chunk.packed and len(data) <= KEPT_CHUNK_BYTES:
-            while len(self._kept) >= KEPT_CHUNKS:
-                self._kept.pop(next(iter(self._kept)), None)
+        if chunk.packed and len(data) <= KEPT_CHUNK_BYTES and len(self._kept) < KEPT_CHUNKS:
             self._kept[chunk] = data
         return data
 
@@ -551,6 +565,7 @@ class Ros1Log(MessageLog):
         found: list[Message] = []
         counts: Counter[int] = Counter()
         at, broken = 0, ""
+        channel_of, new = self._by_id.get, tuple.__new__
         while at >= 0:
             walk = Walk(data, at)
             items = list(walk)
@@ -562,15 +577,17 @@ class Ros1Log(MessageLog):
             for item in items:
                 if isinstance(item, Record):
                     self._connect_within(chunk, item, data)
-                    continue
-                number, log_ns, payload = item
-                counts[number] += 1
-                if (channel := self._by_id.get(number)) is not None:
-                    found.append(Message(log_ns, channel, payload))
-        total_ns = sum(message.log_ns for message in found)
-        self._judge_chunk(chunk, counts, Cause.CUT, "" if chunk.record.torn else broken, total_ns)
-        if any(one.log_ns > following.log_ns for one, following in pairwise(found)):
-            found.sort(key=lambda message: message.log_ns)
+            messages = [item for item in items if not isinstance(item, Record)]
+            counts.update(map(itemgetter(0), messages))
+            found += [
+                new(Message, (log_ns, channel, payload, -1, -1))
+                for number, log_ns, payload in messages
+                if (channel := channel_of(number)) is not None
+            ]
+        times_ns = [message[0] for message in found]
+        self._judge_chunk(chunk, counts, Cause.CUT, "" if chunk.record.torn else broken, sum(times_ns))
+        if any(map(gt, times_ns, islice(times_ns, 1, None))):
+            found.sort(key=itemgetter(0))
         return found
 
     def _after_break(self, chunk: Chunk, walk: Walk, items: list[Item]) -> int:
@@ -624,7 +641,9 @@ class Ros1Log(MessageLog):
                 for span in spans
             ):
                 chosen.append(chunk)
-        ahead = Ahead(self._unpacked, [(c, c.record.u32(b"size")) for c in chosen if c.packed])
+        packed = [(chunk, chunk.record.u32(b"size")) for chunk in chosen if chunk.packed]
+        slow = any(chunk.record.fields[b"compression"] == b"bz2" for chunk, _ in packed)
+        ahead = Ahead(self._unpacked, packed, 0.0 if slow else WORTH_A_THREAD_S)
         self._aheads.add(ahead)
         low, high = start_ns or 0, stop_ns if stop_ns is not None else _END_OF_TIME
         for chunk in chosen:
@@ -632,13 +651,13 @@ class Ros1Log(MessageLog):
             yield Source(chunk.first_ns, select, chunk.last_ns)
 
     def _select(
-        self, chunk: Chunk, wanted: Collection[Channel], low: int, high: int, ahead: Ahead[Chunk, Buffer]
+        self, chunk: Chunk, wanted: frozenset[Channel], low: int, high: int, ahead: Ahead[Chunk, Buffer]
     ) -> Iterator[Message]:
-        return (
-            message
-            for message in self._load(chunk, ahead)
-            if message.channel in wanted and low <= message.log_ns < high
-        )
+        messages = self._load(chunk, ahead)
+        if not wanted.issuperset(self._by_id.values()):
+            messages = [message for message in messages if message[1] in wanted]
+        first, last = bisect_left(messages, low, key=itemgetter(0)), bisect_left(messages, high, key=itemgetter(0))
+        return iter(messages) if last - first == len(messages) else islice(messages, first, last)
 
     def count_before(self, channels: Collection[Channel], stop_ns: int) -> int:
         """How many messages of `channels` were logged before `stop_ns`; by the index, a few chunks are unpacked.

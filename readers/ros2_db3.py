@@ -176,12 +176,13 @@ class SqliteLog(MessageLog):
     def _sound(self, numbers: list[int], start_ns: int, stop_ns: int) -> Iterator[Message]:
         """The messages in the order of time; from where SQLite gives up, what their pages still hold."""
         query = self._query("id, topic_id, timestamp, data", numbers) + " ORDER BY timestamp, id"
-        last, by_id = (start_ns, -1), self._by_id
+        last, channel_of, new = (start_ns, -1), self._by_id.get, tuple.__new__
         try:
             for row, number, log_ns, data in self._database.execute(query, self._arguments(numbers, start_ns, stop_ns)):
                 last = log_ns, row
-                if number in by_id:
-                    yield Message(log_ns, by_id[number], data if isinstance(data, bytes) else str(data).encode())
+                if (channel := channel_of(number)) is not None:
+                    stored = data if type(data) is bytes else str(data).encode()
+                    yield new(Message, (log_ns, channel, stored, -1, -1))
             return
         except sqlite3.DatabaseError as error:
             self._read_pages(str(error))

@@ -10,7 +10,7 @@ from readers.ahead import AHEAD_BLOCKS, AHEAD_BYTES, Ahead
 
 def test_every_block_comes_once_and_no_more_are_begun_than_allowed() -> None:
     begun: list[int] = []
-    ahead = Ahead(lambda key: begun.append(key) or key * 10, [(key, 1000) for key in range(20)])  # type: ignore[func-returns-value]
+    ahead = Ahead(lambda key: begun.append(key) or key * 10, [(key, 1000) for key in range(20)], 0.0)  # type: ignore[func-returns-value]
     assert ahead.take(0) == 0
     assert begun == [0]
     for key in range(1, 20):
@@ -28,7 +28,7 @@ def test_large_blocks_are_not_heaped_up() -> None:
             begun.append(key)
         return key
 
-    ahead = Ahead(load, [(key, AHEAD_BYTES) for key in range(6)])
+    ahead = Ahead(load, [(key, AHEAD_BYTES) for key in range(6)], 0.0)
     for key in range(4):
         assert ahead.take(key) == key
         assert max(begun) <= key + 1
@@ -40,7 +40,7 @@ def test_an_error_comes_out_where_its_block_is_asked_for() -> None:
             raise ValueError("three")
         return key
 
-    ahead = Ahead(load, [(key, 1) for key in range(6)])
+    ahead = Ahead(load, [(key, 1) for key in range(6)], 0.0)
     assert [ahead.take(key) for key in range(3)] == [0, 1, 2]
     with pytest.raises(ValueError, match="three"):
         ahead.take(3)
@@ -56,10 +56,20 @@ def test_nothing_runs_after_stop() -> None:
         running.remove(key)
         return key
 
-    ahead = Ahead(load, [(key, 1) for key in range(10)])
+    ahead = Ahead(load, [(key, 1) for key in range(10)], 0.0)
     ahead.take(0)
     ahead.take(1)
     ahead.stop()
     assert running == []
     time.sleep(0.05)
     assert running == []
+
+
+@pytest.mark.parametrize(("pause_s", "ahead_too"), [(60.0, False), (0.02, True)])
+def test_blocks_are_begun_only_where_there_is_work_to_hide_them_behind(pause_s: float, ahead_too: bool) -> None:
+    ahead = Ahead(lambda key: threading.get_ident(), [(key, 1) for key in range(6)], pause_s)
+    ahead.take(0)
+    time.sleep(0.03)
+    ahead.take(1)
+    assert (ahead.take(2) != threading.get_ident()) is ahead_too
+    ahead.stop()
