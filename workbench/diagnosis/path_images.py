@@ -198,7 +198,7 @@ def _dirty(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     rigid = np.abs(signals.case["scale"] - 1.0) < bounds["max_scale_change"]  # as in noise
     matched = rigid & (signals.correlation > bounds["min_correlation"])
     always = (residual > bounds["always_factor"]) & poor[signals.template_row] & smooth & matched
-    always = lasting(always, int(bounds["min_frames"]))
+    always &= lasting(always | ~signals.accepted, int(bounds["min_frames"]))  # one alone is a bad template
     held = _held(signals, bounds, before) & (residual > bounds["held_factor"])
     weak = (poor & smooth) | held | signals.case.rings(Verdict.REACQUIRED | Verdict.LOST)
     return extended((held | always) & ~before, weak & ~before)
