@@ -7,14 +7,14 @@ from pipelines import lens
 from readers.streams import Camera
 
 WAVES = np.random.default_rng(11)
-DIRECTIONS = WAVES.normal(0, 1, (24, 2))
-PHASES = WAVES.uniform(0, 2 * np.pi, 24)
+DIRECTIONS = WAVES.normal(0, 1, (12, 2))
+PHASES = WAVES.uniform(0, 2 * np.pi, 12)
 
 
 def plane_grey(x: np.ndarray, y: np.ndarray, wave: float) -> np.ndarray:
-    """Grey levels of a plane at (x, y) in m: 24 waves of about `wave` rad/m, any shape."""
+    """Grey levels of a plane at (x, y) in m: 12 waves of about `wave` rad/m, any shape."""
     waves = np.sin(wave * (x[..., None] * DIRECTIONS[:, 0] + y[..., None] * DIRECTIONS[:, 1]) + PHASES)
-    return 128 + 14 * waves.sum(-1)
+    return 128 + 20 * waves.sum(-1)
 
 
 def seen(camera: Camera, cam_T_world: np.ndarray, wave: float = 12.0) -> np.ndarray:

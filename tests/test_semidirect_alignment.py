@@ -126,20 +126,17 @@ def test_no_motion_is_found_exactly_with_distortion_and_relief() -> None:
     assert found.inlier.sum() == found.visible.sum() > 100
 
 
-def test_small_motions_over_a_rendered_plane() -> None:
-    rng = np.random.default_rng(5)
-    camera = lens.pinhole(752, 480, 420.0, distortion=(-0.1, 0.02, 1e-3, -1e-3))
-    pose = looking_down()
-    first = pyramid_of(seen(camera, pose))
-    pixels = rng.uniform((40, 40), (711, 439), (120, 2))
-    points = moved(on_plane(camera, pose, pixels), pose)
-    for scale in (0.3, 1.0):
-        xi = scale * np.array([0.02, -0.015, 0.01, 0.006, -0.005, 0.01])
-        second = pyramid_of(seen(camera, se3_exp(xi) @ pose))
-        found = align(first, second, optics_of(camera), pixels, points, np.eye(4), OPTIONS)
-        shift = lens.project(camera, moved(points, found.cur_T_ref)) - lens.project(camera, moved(points, se3_exp(xi)))
-        assert np.sqrt(np.mean(shift**2)) < 0.02 * (1 + scale)  # px of level 0
-        assert found.inlier.sum() > 110
+@pytest.mark.parametrize("scale", [0.3, 1.0])
+def test_small_motions_over_a_rendered_plane(scale: float) -> None:
+    """What remains is the bilinear samples' error and rounding to whole grey levels."""
+    pose, pixels = looking_down(), np.random.default_rng(5).uniform((30, 30), (345, 209), (120, 2))
+    points = moved(on_plane(CAMERA, pose, pixels), pose)
+    truth = se3_exp(scale * np.array([0.02, -0.015, 0.01, 0.006, -0.005, 0.01]))
+    first, second = (pyramid_of(seen(CAMERA, cam @ pose)) for cam in (np.eye(4), truth))
+    found = align(first, second, optics_of(CAMERA), pixels, points, np.eye(4), OPTIONS)
+    error = lens.project(CAMERA, moved(points, found.cur_T_ref)) - lens.project(CAMERA, moved(points, truth))
+    assert np.sqrt(np.mean(error**2)) < 0.02  # px of level 0
+    assert found.inlier.sum() > 110
 
 
 def test_gain_and_offset_are_found() -> None:

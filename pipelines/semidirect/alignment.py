@@ -260,7 +260,7 @@ def align(
     levels = range(options.coarsest, options.finest - 1, -1)
     cost = np.full((len(levels), options.iterations + 1), np.nan)
     iterations, stop = np.zeros(len(levels), np.int64), np.zeros(len(levels), np.int64)
-    motion: tuple[Floats, float, float] = (start, 1.0, 0.0)
+    motion = (start, 1.0, 0.0)
     for k, level in enumerate(levels):
         found = align_level(reference, current, level, optics, pixels, points_in_ref, *motion, options, cost[k])
         motion = (found.cur_T_ref, found.gain, found.offset)
@@ -268,8 +268,10 @@ def align(
     rms = np.sqrt(found.mean_square)
     middle = float(np.median(rms[found.visible])) if found.visible.any() else np.nan
     return Alignment(
-        *motion,
+        found.cur_T_ref,
         _covariance(found, 8 if options.illumination else 6),
+        found.gain,
+        found.offset,
         cost,
         iterations,
         stop,
@@ -340,7 +342,7 @@ def _covariance(found: Level, unknowns: int) -> Floats:
 def _inside(image: Grey, u: float, v: float, margin: float) -> bool:
     """Whether a square of that margin around a place has all its bilinear neighbours; False for NaN."""
     rows, columns = image.shape
-    return margin <= u < columns - 1 - margin and margin <= v < rows - 1 - margin
+    return bool(margin <= u < columns - 1 - margin and margin <= v < rows - 1 - margin)
 
 
 @compiled
