@@ -121,15 +121,19 @@ def _earth_r_enu(latitude_rad: float, longitude_rad: float) -> Floats:
 
 @compiled
 def hat(w: Floats) -> Floats:
-    """The matrix [3, 3] of the cross product: hat(w) p = w x p."""
+    """The matrix [3, 3] of the cross product with w: its product with p is w x p."""
     return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
 
 
 @compiled
 def so3_exp(w: Floats) -> Floats:
     """Rotation [3, 3] of a rotation vector [3], rad: I + sin θ/θ W + (1 - cos θ)/θ² W² (Rodrigues)."""
-    first, second, _ = _exponential_factors(math.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2))
-    return np.eye(3) + first * hat(w) + second * _hat_squared(w)
+    first, second, _ = _exponential_factors(_length(w))
+    one, two = hat(w), _hat_squared(w)
+    for i in range(3):
+        for j in range(3):
+            two[i, j] = (i == j) + first * one[i, j] + second * two[i, j]
+    return two
 
 
 @compiled
@@ -139,21 +143,21 @@ def so3_log(r: Floats) -> Floats:
     θ = atan2(|v|, (tr R - 1)/2) with the axial vector v = sin θ · axis; near π, where v vanishes, the axis comes
     from the largest column of (R + Rᵀ)/2 - cos θ I = (1 - cos θ) axis axisᵀ.
     """
-    v = np.array([r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]]) / 2
-    sine = math.sqrt(v[0] ** 2 + v[1] ** 2 + v[2] ** 2)
-    cosine = (r[0, 0] + r[1, 1] + r[2, 2] - 1) / 2
-    angle = math.atan2(sine, cosine)
-    if cosine > -0.9:
-        return v * (angle / sine if sine > 1e-8 else 1.0)
-    k = 0
-    for j in range(1, 3):
-        if r[j, j] > r[k, k]:
-            k = j
-    column = (r[:, k] + r[k, :]) / 2
-    column[k] -= cosine
-    length = math.sqrt(column[0] ** 2 + column[1] ** 2 + column[2] ** 2)
-    sign = -1.0 if column[0] * v[0] + column[1] * v[1] + column[2] * v[2] < 0 else 1.0
-    return column * (sign * angle / length)
+    axis = np.array([(r[2, 1] - r[1, 2]) / 2, (r[0, 2] - r[2, 0]) / 2, (r[1, 0] - r[0, 1]) / 2])
+    sine, cosine = _length(axis), (r[0, 0] + r[1, 1] + r[2, 2] - 1) / 2
+    factor = math.atan2(sine, cosine) / sine if sine > 1e-8 else 1.0
+    if cosine <= -0.9:
+        k = 0
+        for j in range(1, 3):
+            if r[j, j] > r[k, k]:
+                k = j
+        along = axis[k]
+        for j in range(3):
+            axis[j] = (r[j, k] + r[k, j]) / 2 - (cosine if j == k else 0.0)
+        factor = math.copysign(math.atan2(sine, cosine), along) / _length(axis)
+    for j in range(3):
+        axis[j] *= factor
+    return axis
 
 
 @compiled
@@ -162,14 +166,15 @@ def se3_exp(xi: Floats) -> Floats:
 
     V = I + (1 - cos θ)/θ² W + (θ - sin θ)/θ³ W² (Murray, Li, Sastry 1994, 2.36).
     """
-    rho, w = xi[:3], xi[3:]
-    first, second, third = _exponential_factors(math.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2))
+    w = xi[3:]
+    first, second, third = _exponential_factors(_length(w))
     one, two = hat(w), _hat_squared(w)
-    transform = np.eye(4)
+    transform = np.zeros((4, 4))
+    transform[3, 3] = 1.0
     for i in range(3):
         for j in range(3):
-            transform[i, j] += first * one[i, j] + second * two[i, j]
-            transform[i, 3] += ((i == j) + second * one[i, j] + third * two[i, j]) * rho[j]
+            transform[i, j] = (i == j) + first * one[i, j] + second * two[i, j]
+            transform[i, 3] += ((i == j) + second * one[i, j] + third * two[i, j]) * xi[j]
     return transform
 
 
@@ -177,26 +182,26 @@ def se3_exp(xi: Floats) -> Floats:
 def se3_log(transform: Floats) -> Floats:
     """Twist ξ = (ρ, ω) [6] of a transform [4, 4]: the inverse of `se3_exp` for rotations up to π.
 
-    ρ = V⁻¹ t, V⁻¹ = I - W/2 + (1 - θ sin θ/(2 (1 - cos θ)))/θ² W².
+    ρ = V⁻¹ t, V⁻¹ = I - W/2 + (1 - θ/(2 tan(θ/2)))/θ² W².
     """
     w = so3_log(transform[:3, :3])
-    angle = math.sqrt(w[0] ** 2 + w[1] ** 2 + w[2] ** 2)
-    if angle < 1e-3:
-        factor = 1 / 12 + angle**2 / 720
-    else:
-        factor = (1 - angle / (2 * math.tan(angle / 2))) / angle**2
-    inverse = np.eye(3) - hat(w) / 2 + factor * _hat_squared(w)
-    xi = np.empty(6)
-    xi[3:] = w
+    angle = _length(w)
+    near = angle < 1e-3
+    factor = 1 / 12 + angle**2 / 720 if near else (1 - angle / (2 * math.tan(angle / 2))) / angle**2
+    one, two = hat(w), _hat_squared(w)
+    xi = np.zeros(6)
     for i in range(3):
-        xi[i] = inverse[i, 0] * transform[0, 3] + inverse[i, 1] * transform[1, 3] + inverse[i, 2] * transform[2, 3]
+        xi[3 + i] = w[i]
+        for j in range(3):
+            xi[i] += ((i == j) - one[i, j] / 2 + factor * two[i, j]) * transform[j, 3]
     return xi
 
 
 @compiled
 def se3_inverse(transform: Floats) -> Floats:
     """The inverse [4, 4] of a transform: rotation Rᵀ, translation -Rᵀ t."""
-    inverse = np.eye(4)
+    inverse = np.zeros((4, 4))
+    inverse[3, 3] = 1.0
     for i in range(3):
         for j in range(3):
             inverse[i, j] = transform[j, i]
@@ -207,7 +212,8 @@ def se3_inverse(transform: Floats) -> Floats:
 @compiled
 def se3_product(a: Floats, b: Floats) -> Floats:
     """The transform [4, 4] that applies `b` first: a b."""
-    product = np.eye(4)
+    product = np.zeros((4, 4))
+    product[3, 3] = 1.0
     for i in range(3):
         for j in range(4):
             total = a[i, 3] if j == 3 else 0.0
@@ -218,10 +224,17 @@ def se3_product(a: Floats, b: Floats) -> Floats:
 
 
 @compiled
+def _length(w: Floats) -> float:
+    return math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+
+
+@compiled
 def _hat_squared(w: Floats) -> Floats:
     """W² = w wᵀ - |w|² I, [3, 3]."""
-    squared: Floats = np.outer(w, w) - (w[0] ** 2 + w[1] ** 2 + w[2] ** 2) * np.eye(3)
-    return squared
+    x, y, z = w
+    return np.array(
+        [[-(y * y + z * z), x * y, x * z], [x * y, -(x * x + z * z), y * z], [x * z, y * z, -(x * x + y * y)]]
+    )
 
 
 @compiled

@@ -42,7 +42,10 @@ def test_derivatives_by_the_twist(level: int) -> None:
     for i in np.flatnonzero(patches.usable):
         for a in range(6):
             there, back = (
-                [on_level(x, level) for x in project(optics, *moved(points[i : i + 1], se3_exp(s * np.eye(6)[a]))[0])[:2]]
+                [
+                    on_level(x, level)
+                    for x in project(optics, *moved(points[i : i + 1], se3_exp(s * np.eye(6)[a]))[0])[:2]
+                ]
                 for s in (h, -h)
             )
             slope = (np.array(there) - back) / (2 * h)
@@ -82,9 +85,7 @@ def test_kernel_against_plain_numpy() -> None:
         slope_u = (plain_sample(images[0], u + 1, v) - plain_sample(images[0], u - 1, v)) / 2
         slope_v = (plain_sample(images[0], u, v + 1) - plain_sample(images[0], u, v - 1)) / 2
         r = plain_sample(images[1], place[0] + dx, place[1] + dy) - gain * grey - offset
-        j = np.column_stack(
-            [np.column_stack([slope_u, slope_v]) @ patches.jacobian[i], grey, np.ones(16)]
-        )
+        j = np.column_stack([np.column_stack([slope_u, slope_v]) @ patches.jacobian[i], grey, np.ones(16)])
         rows.append((j, r))
         squares.append(np.mean(r**2))
     j, r = (np.concatenate(x) for x in zip(*rows, strict=True))
@@ -109,7 +110,7 @@ def test_a_shift_by_whole_pixels_is_found_exactly(illumination: bool) -> None:
         reference, current, optics_of(PLAIN), pixels, points, start,
         Options(tolerance=1e-9, illumination=illumination),
     )  # fmt: skip
-    assert np.max(np.abs(se3_log(np.linalg.inv(truth) @ found.cur_T_ref))) < 1e-6
+    assert np.max(np.abs(se3_log(np.linalg.inv(truth) @ found.cur_t_ref))) < 1e-6
     assert found.final_cost < 1e-8
     assert found.stop[-1] in (Stop.CONVERGED, Stop.ROSE)
     assert found.cost[0, 0] > 100 * found.cost[-1, 0]
@@ -122,7 +123,7 @@ def test_no_motion_is_found_exactly_with_distortion_and_relief() -> None:
     points = at_depth(CAMERA, pixels, 1.6 + 0.2 * np.sin(pixels[:, 0]))
     start = se3_exp(np.array([0.01, -0.02, 0.02, 0.01, -0.01, 0.02]))
     found = align(frame, frame, optics_of(CAMERA), pixels, points, start, Options(tolerance=1e-9))
-    assert np.max(np.abs(se3_log(found.cur_T_ref))) < 1e-6
+    assert np.max(np.abs(se3_log(found.cur_t_ref))) < 1e-6
     assert found.inlier.sum() == found.visible.sum() > 100
 
 
@@ -134,7 +135,7 @@ def test_small_motions_over_a_rendered_plane(scale: float) -> None:
     truth = se3_exp(scale * np.array([0.02, -0.015, 0.01, 0.006, -0.005, 0.01]))
     first, second = (pyramid_of(seen(CAMERA, cam @ pose)) for cam in (np.eye(4), truth))
     found = align(first, second, optics_of(CAMERA), pixels, points, np.eye(4), OPTIONS)
-    error = lens.project(CAMERA, moved(points, found.cur_T_ref)) - lens.project(CAMERA, moved(points, truth))
+    error = lens.project(CAMERA, moved(points, found.cur_t_ref)) - lens.project(CAMERA, moved(points, truth))
     assert np.sqrt(np.mean(error**2)) < 0.02  # px of level 0
     assert found.inlier.sum() > 110
 
@@ -149,7 +150,7 @@ def test_gain_and_offset_are_found() -> None:
     found = align(a, b, optics_of(camera), pixels, points, np.eye(4), Options(illumination=True))
     assert found.gain == pytest.approx(0.8, abs=0.01)
     assert found.offset == pytest.approx(15, abs=1.5)
-    assert np.allclose(se3_log(found.cur_T_ref), [0.01, 0.005, 0, 0, 0, 0.01], atol=1e-3)
+    assert np.allclose(se3_log(found.cur_t_ref), [0.01, 0.005, 0, 0, 0, 0.01], atol=1e-3)
     blind = align(a, b, optics_of(camera), pixels, points, np.eye(4), OPTIONS)
     assert blind.final_cost > 10 * found.final_cost
 
@@ -165,7 +166,7 @@ def test_what_does_not_carry_a_pose_is_said() -> None:
     away = se3_exp(np.array([9.0, 0, 0, 0, 0, 0]))
     found = align(textured, textured, optics_of(PLAIN), pixels, points, away, OPTIONS)
     assert set(found.stop) == {Stop.TOO_FEW_PATCHES}
-    assert np.array_equal(found.cur_T_ref, away)
+    assert np.array_equal(found.cur_t_ref, away)
     assert not found.inlier.any()
 
 
@@ -204,7 +205,7 @@ def test_the_covariance_is_consistent_with_noise() -> None:
     for _ in range(60):
         noisy = np.clip(np.round(image + rng.normal(0, 12, image.shape)), 0, 255).astype(np.uint8)
         found = align(reference, pyramid_of(noisy), optics_of(PLAIN), pixels, points, np.eye(4), options)
-        xi = se3_log(found.cur_T_ref)
+        xi = se3_log(found.cur_t_ref)
         nees.append(xi @ np.linalg.solve(found.covariance, xi))
     low, high = stats.chi2(6 * len(nees)).ppf([1e-4, 1 - 1e-4]) / len(nees)
     assert low < np.mean(nees) < high

@@ -160,7 +160,7 @@ def test_failures_of_a_patch_have_their_causes() -> None:
     image, patch = noise_texture((40, 40), 2, 6), np.empty((10, 10))
     warped_patch(np.full((40, 40), 9, np.uint8), 20.0, 20.0, np.eye(2), patch)
     assert align_patch(image, patch, 20.0, 20.0, FeatureOptions()).outcome == Outcome.FLAT
-    v, u = np.mgrid[:40, :40]
+    u = np.mgrid[:40, :40][1]
     warped_patch((3 * u).astype(np.uint8), 20.0, 20.0, np.eye(2), patch)  # an edge tells nothing along itself
     assert align_patch(image, patch, 20.0, 20.0, FeatureOptions()).outcome == Outcome.FLAT
     warped_patch(image, 20.0, 20.0, np.eye(2), patch)
@@ -186,7 +186,12 @@ def test_points_of_a_rendered_plane_are_found() -> None:
     wrong = se3_exp(np.array([0.006, -0.004, 0, 0, 0, 0]))
     refs = references(pixels, depth, rng.integers(0, 2, 60), FACING)
     found = align_features(
-        key.buffer[None], current, optics_of(CAMERA), (wrong @ second @ np.linalg.inv(first))[None], refs, FeatureOptions()
+        key.buffer[None],
+        current,
+        optics_of(CAMERA),
+        (wrong @ second @ np.linalg.inv(first))[None],
+        refs,
+        FeatureOptions(),
     )
     truth = lens.project(CAMERA, moved(world, second))
     inside = np.all((truth > 30) & (truth < (345, 209)), axis=1)

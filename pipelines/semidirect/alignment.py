@@ -94,13 +94,14 @@ class Residuals(NamedTuple):
 class Alignment(NamedTuple):
     """A motion, and how it was found. L levels from `coarsest` to `finest`.
 
-    `cur_T_ref` [4, 4]; `covariance` [6, 6] of the twist ξ (m, rad) with T_true = T exp(ξ): the inverse Hessian times
+    `cur_t_ref` [4, 4]; `covariance` [6, 6] of the twist ξ (m, rad) with T_true = T exp(ξ): the inverse Hessian times
     the residuals' variance, NaN where it is singular. `cost` [L, iterations + 1]: the mean squared residual (grey
     levels²) before each iteration and after the last, NaN beyond; `iterations` [L]; `stop` [L] a `Stop` each. A last
-    cost above the one before it was not taken. On the finest level, at the end: `visible` [n], `residual_rms` [n] of each patch, `inlier` [n], `final_cost`.
+    cost above the one before it was not taken. On the finest level, at the end: `visible` [n], `residual_rms` [n] of
+    each patch, `inlier` [n], `final_cost`.
     """
 
-    cur_T_ref: Floats
+    cur_t_ref: Floats
     covariance: Floats
     gain: float
     offset: float
@@ -150,7 +151,7 @@ def residuals(
     gain: float,
     offset: float,
 ) -> Residuals:
-    """r = I_cur(π(T p)) - g I_ref - o of every patch that the current frame shows wholly, and what they sum to."""
+    """Residuals r = I_cur(π(T p)) - g I_ref - o of every patch that the current frame shows wholly, and its sums."""
     n = len(points_in_ref)
     image = level_image(current, level)
     mean_square, visible = np.full(n, math.nan), np.zeros(n, np.bool_)
@@ -216,7 +217,7 @@ def hessian(patches: Patches, visible: Flags) -> Floats:
 class Level(NamedTuple):
     """What one level yields: the motion, why it ended, and the residuals and their Hessian there."""
 
-    cur_T_ref: Floats
+    cur_t_ref: Floats
     gain: float
     offset: float
     iterations: int
@@ -263,12 +264,12 @@ def align(
     motion = (start, 1.0, 0.0)
     for k, level in enumerate(levels):
         found = align_level(reference, current, level, optics, pixels, points_in_ref, *motion, options, cost[k])
-        motion = (found.cur_T_ref, found.gain, found.offset)
+        motion = (found.cur_t_ref, found.gain, found.offset)
         iterations[k], stop[k] = found.iterations, found.stop
     rms = np.sqrt(found.mean_square)
     middle = float(np.median(rms[found.visible])) if found.visible.any() else np.nan
     return Alignment(
-        found.cur_T_ref,
+        found.cur_t_ref,
         _covariance(found, 8 if options.illumination else 6),
         found.gain,
         found.offset,

@@ -82,7 +82,7 @@ def corners(pyramid: Pyramid, occupied: Flags, options: CornerOptions) -> Corner
     detector = cv2.FastFeatureDetector.create(options.fast_threshold)
     for level in range(CORNER_LEVELS):
         image = level_image(pyramid, level)
-        found = cv2.KeyPoint.convert(detector.detect(image))
+        found = np.asarray(cv2.KeyPoint.convert(detector.detect(image)), np.float32)
         if len(found):
             keep_best_of_cells(image, level, found, occupied, options.cell_px, best)
     best = best[best[:, 0] > options.min_score]
@@ -269,8 +269,8 @@ class Features(NamedTuple):
     """Alignments of n points; pixels on level 0, px of the level for the rest; NaN where it did not come so far.
 
     `pixels` [n, 2]; `predicted` [n, 2] the projections that they started from; `level` [n] the level searched, -1 if
-    none; `outcome` [n] an `Outcome` each; `mean_difference` [n] and `residual_rms` [n] in grey levels; `iterations` [n];
-    `affine` [n, 2, 2] from the reference's to the current level 0.
+    none; `outcome` [n] an `Outcome` each; `mean_difference` [n] and `residual_rms` [n] in grey levels;
+    `iterations` [n]; `affine` [n, 2, 2] from the reference's to the current level 0.
     """
 
     pixels: Floats
@@ -287,8 +287,8 @@ class References(NamedTuple):
     """What the keyframes saw of n points.
 
     `frame` [n]: the keyframe's row in the stack of pyramids and poses; `pixels` [n, 2] on level 0; `level` [n];
-    `depth` [n], z in the keyframe, m; `normal` [n, 3] of the local plane in the keyframe's axes; `cosine` [n] of the angle
-    between the two views.
+    `depth` [n], z in the keyframe, m; `normal` [n, 3] of the local plane in the keyframe's axes; `cosine` [n] of the
+    angle between the two views.
     """
 
     frame: Longs

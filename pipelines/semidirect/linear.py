@@ -17,7 +17,7 @@ SMALLEST_PIVOT = 1e-12
 
 @compiled
 def factor(h: Floats, n: int) -> bool:
-    """Put L of H = L Lᵀ into the lower triangle of the first n rows and columns; False if H is not positive definite."""
+    """Put L of H = L Lᵀ into the lower triangle of the first n rows; False if H is not positive definite."""
     for j in range(n):
         pivot = h[j, j]
         for k in range(j):
@@ -50,7 +50,9 @@ def substitute(factored: Floats, x: Floats, n: int) -> None:
 def inverse(h: Floats, n: int) -> Floats:
     """H⁻¹ [n, n] of a symmetric matrix whose lower triangle is given; NaN if it is not positive definite."""
     factored = h.copy()
-    found = np.eye(n)
+    found = np.zeros((n, n))
+    for j in range(n):
+        found[j, j] = 1.0
     if not factor(factored, n):
         found[:] = math.nan
         return found
