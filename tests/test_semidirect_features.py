@@ -24,7 +24,7 @@ from pipelines.semidirect.features import (
     warped_patch,
 )
 from pipelines.semidirect.optics import optics_of
-from pipelines.semidirect.pyramid import level_image, on_finest, on_level, pyramid_of, sample
+from pipelines.semidirect.pyramid import level_image, on_finest, pyramid_of, sample
 
 CAMERA = lens.pinhole(376, 240, 210.0, distortion=(-0.1, 0.02, 1e-3, -1e-3))
 FACING = np.array([0.0, 0.0, 1.0])
@@ -222,5 +222,7 @@ def test_what_is_not_searched_says_why() -> None:
         Outcome.OUT_OF_VIEW, Outcome.OBLIQUE, Outcome.REFERENCE_OUT_OF_VIEW, Outcome.ALIGNED
     ]  # fmt: skip
     assert np.allclose(found.pixels[3], pixels[3], atol=1e-9)
-    assert np.allclose(on_level(pixels[3, 0], 0), pixels[3, 0])
     assert np.isnan(found.pixels[:3]).all()
+    small = pyramid_of(noise_texture((64, 64), 2, 9))
+    with pytest.raises(ValueError, match="differ in size"):
+        align_features(small.buffer[None], image, optics_of(CAMERA), poses, refs, FeatureOptions())

@@ -241,7 +241,7 @@ def peer_of_bundle(start: np.ndarray, observations: Observations, places: np.nda
 
 
 def test_a_bundle_agrees_with_scipy() -> None:
-    cams, points = keyframes(4), scene(14, 15)
+    cams, points = keyframes(4), scene(9, 15)
     observations = seen_by_all(cams, points)
     pixels = noisy(observations.pixels, observations.level, 0.6, np.random.default_rng(16))
     pixels[::17] += 12  # Huber has something to do
@@ -296,7 +296,27 @@ def test_the_covariance_of_a_bundle_is_consistent() -> None:
     assert 0.85 < np.mean(nees) / 6 < 1.15
 
 
-def test_a_bundle_without_scale_is_refused() -> None:
+def test_a_bundle_of_held_keyframes_is_that_of_its_points() -> None:
+    """Without free poses, and without Huber, each point is refined on its own."""
+    cams, points = keyframes(4), scene(20, 22)
+    observations = seen_by_all(cams, points)
+    shaken = noisy(observations.pixels, observations.level, 0.5, np.random.default_rng(23))
+    observations = observations._replace(pixels=shaken)
+    options = BundleOptions(iterations=50, huber_px=1e9, tolerance=0.0)
+    found = adjust(OPTICS, cams, np.ones(4, np.bool_), observations, points, options)
+    alone = refine_points(OPTICS, cams, observations, points, 20)
+    assert np.array_equal(found.cams_t_world, cams)
+    assert np.max(np.abs(found.points - alone.points)) < 1e-6
+
+
+def test_what_cannot_be_refined_is_refused() -> None:
     cams, points = keyframes(3), scene(5, 21)
+    observations = seen_by_all(cams, points)
+    with pytest.raises(ValueError, match="do not belong to 4 points and 3 keyframes"):
+        adjust(OPTICS, cams, oldest_fixed(3), observations, points[1:], BundleOptions())
+    with pytest.raises(ValueError, match="do not belong to 5 points and 2 keyframes"):
+        adjust(OPTICS, cams[:2], oldest_fixed(2), observations, points, BundleOptions())
+    with pytest.raises(ValueError, match="one of each"):
+        refine_pose(OPTICS, points, np.zeros((4, 2)), levels(5), TRUTH, PoseOptions())
     with pytest.raises(ValueError, match="1 keyframes are fixed"):
         adjust(OPTICS, cams, np.arange(3) < 1, seen_by_all(cams, points), points, BundleOptions())

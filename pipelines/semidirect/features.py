@@ -367,7 +367,12 @@ def align_features(
         cur_T_key: transforms [k, 4, 4] from each keyframe to the current frame, as known so far.
         references: what the keyframes saw of the points.
         options: stop rules.
+
+    Raises:
+        ValueError: keyframes that are not of the current frame's size.
     """
+    if keyframes.shape[1] != len(current.buffer):
+        raise ValueError("keyframes and current frame differ in size: align features of frames of one size")
     n = len(references.frame)
     found = Features(
         np.full((n, 2), math.nan),

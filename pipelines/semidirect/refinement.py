@@ -60,9 +60,9 @@ class RefinedPose(NamedTuple):
     """A pose from n points.
 
     `cam_t_world` [4, 4]; `covariance` [6, 6] of ξ with T_true = exp(ξ) T: s² (Σ w Jᵀ J)⁻¹; `scale_px` s: 1.4826
-    median |e| of the components in the end; `error_px` [n] and `error_before_px` [n] |e|; `inlier` [n]; `cost` [iterations + 1]
-    Tukey's cost before each iteration and after the last, NaN beyond; `scale` [iterations + 1] the scale that it was
-    taken with; `iterations`; `solved`: False where the Hessian was singular.
+    median |e| of the components in the end; `error_px` [n] and `error_before_px` [n] |e|; `inlier` [n]; `cost`
+    [iterations + 1] Tukey's cost before each iteration and after the last, NaN beyond; `scale` [iterations + 1] the
+    scale that it was taken with; `iterations`; `solved`: False where the Hessian was singular.
     """
 
     cam_t_world: Floats
@@ -142,7 +142,12 @@ def refine_pose(
         level: the levels [n] on which they were found.
         start: the first guess [4, 4].
         options: settings.
+
+    Raises:
+        ValueError: numbers of points, pixels and levels that differ.
     """
+    if not len(points) == len(pixels) == len(level):
+        raise ValueError(f"{len(points)} points, {len(pixels)} pixels, {len(level)} levels: give one of each per point")
     before = pose_errors(optics, points, pixels, level, start, 1.0)
     cost, scale = np.full((2, options.iterations + 1), np.nan)
     transform, done, solved = start, 0, True
@@ -370,8 +375,10 @@ def adjust(
         options: settings.
 
     Raises:
-        ValueError: fewer than two keyframes are held, so that pose or scale of the whole is free.
+        ValueError: fewer than two keyframes are held, so that pose or scale of the whole is free; observations that
+            are not of these points or keyframes.
     """
+    _demand_matching(cams_T_world, fixed, observations, points)
     if np.count_nonzero(fixed) < 2:
         raise ValueError(f"{np.count_nonzero(fixed)} keyframes are fixed: hold two, else the scale is free")
     slot = np.where(fixed, -1, np.cumsum(~fixed) - 1)
@@ -391,6 +398,19 @@ def adjust(
     return Bundle(poses, places, spread, normal.error_px, inlier, cost, damping, accepted, done)
 
 
+def _demand_matching(cams_T_world: Floats, fixed: Flags, observations: Observations, points: Floats) -> None:
+    """Compiled code does not look whether an index lies in its array."""
+    frame = observations.frame
+    fits = len(observations.first) == len(points) + 1 and observations.first[-1] == len(frame)
+    known = len(frame) == 0 or (frame.min() >= 0 and frame.max() < len(cams_T_world))
+    if not (fits and known and len(fixed) == len(cams_T_world)):
+        raise ValueError(
+            f"{len(frame)} observations of {len(observations.first) - 1} points in keyframes up to "
+            f"{frame.max(initial=-1)} do not belong to {len(points)} points and {len(cams_T_world)} keyframes, "
+            f"{len(fixed)} of them marked; rebuild the observations after points or keyframes are removed"
+        )
+
+
 @compiled
 def huber_cost(e: float, width: float) -> float:
     """ρ(e) = ½ e² up to the width, width (e - width/2) beyond."""
@@ -403,7 +423,8 @@ def normal_equations(
 ) -> Normal:
     """Linearise all observations; `slot` [k] is a keyframe's place among the free ones, -1 for a held one.
 
-    Huber's weights w = min(1, width/|e|). An observation without pixel makes the cost infinite.
+    Huber's weights w = min(1, width/|e|). An observation without pixel (NaN in `error_px`) makes the cost infinite,
+    so that no step is taken there.
     """
     n, m, free = len(points), len(observations.frame), 6 * np.count_nonzero(slot >= 0)
     poses, pose_side = np.zeros((free, free)), np.zeros(free)
