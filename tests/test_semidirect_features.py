@@ -182,7 +182,7 @@ def test_points_of_a_rendered_plane_are_found() -> None:
     key, current = (pyramid_of(seen(CAMERA, pose, 25)) for pose in (first, second))
     pixels = rng.uniform((40, 30), (335, 209), (60, 2))
     world = on_plane(CAMERA, first, pixels)
-    depth = moved(world, first)[:, 2]
+    depth = moved(world, first)[:, 2].copy()
     wrong = se3_exp(np.array([0.006, -0.004, 0, 0, 0, 0]))
     refs = references(pixels, depth, rng.integers(0, 2, 60), FACING)
     found = align_features(
