@@ -10,6 +10,8 @@ import math
 import numpy as np
 from numpy.typing import NDArray
 
+from pipelines.compiled import compiled
+
 Floats = NDArray[np.float64]
 
 
@@ -112,3 +114,138 @@ def _earth_r_enu(latitude_rad: float, longitude_rad: float) -> Floats:
     north = [-sin_lat * cos_lon, -sin_lat * sin_lon, cos_lat]
     up = [cos_lat * cos_lon, cos_lat * sin_lon, sin_lat]
     return np.array([east, north, up]).T
+
+
+# ------------------------------------------------------------------------------ SO(3) and SE(3)
+
+
+@compiled
+def hat(w: Floats) -> Floats:
+    """The matrix [3, 3] of the cross product with w: its product with p is w x p."""
+    return np.array([[0.0, -w[2], w[1]], [w[2], 0.0, -w[0]], [-w[1], w[0], 0.0]])
+
+
+@compiled
+def so3_exp(w: Floats) -> Floats:
+    """Rotation [3, 3] of a rotation vector [3], rad: I + sin θ/θ W + (1 - cos θ)/θ² W² (Rodrigues)."""
+    first, second, _ = _exponential_factors(_length(w))
+    one, two = hat(w), _hat_squared(w)
+    for i in range(3):
+        for j in range(3):
+            two[i, j] = (i == j) + first * one[i, j] + second * two[i, j]
+    return two
+
+
+@compiled
+def so3_log(r: Floats) -> Floats:
+    """Rotation vector [3] of a rotation [3, 3], of length within [0, π]; the inverse of `so3_exp`.
+
+    θ = atan2(|v|, (tr R - 1)/2) with the axial vector v = sin θ · axis; near π, where v vanishes, the axis comes
+    from the largest column of (R + Rᵀ)/2 - cos θ I = (1 - cos θ) axis axisᵀ.
+    """
+    axis = np.array([(r[2, 1] - r[1, 2]) / 2, (r[0, 2] - r[2, 0]) / 2, (r[1, 0] - r[0, 1]) / 2])
+    sine, cosine = _length(axis), (r[0, 0] + r[1, 1] + r[2, 2] - 1) / 2
+    factor = math.atan2(sine, cosine) / sine if sine > 1e-8 else 1.0
+    if cosine <= -0.9:
+        k = 0
+        for j in range(1, 3):
+            if r[j, j] > r[k, k]:
+                k = j
+        along = axis[k]
+        for j in range(3):
+            axis[j] = (r[j, k] + r[k, j]) / 2 - (cosine if j == k else 0.0)
+        factor = math.copysign(math.atan2(sine, cosine), along) / _length(axis)
+    for j in range(3):
+        axis[j] *= factor
+    return axis
+
+
+@compiled
+def se3_exp(xi: Floats) -> Floats:
+    """Transform [4, 4] of a twist ξ = (ρ, ω) [6], m and rad: R = exp ω, t = V ρ.
+
+    V = I + (1 - cos θ)/θ² W + (θ - sin θ)/θ³ W² (Murray, Li, Sastry 1994, 2.36).
+    """
+    w = xi[3:]
+    first, second, third = _exponential_factors(_length(w))
+    one, two = hat(w), _hat_squared(w)
+    transform = np.zeros((4, 4))
+    transform[3, 3] = 1.0
+    for i in range(3):
+        for j in range(3):
+            transform[i, j] = (i == j) + first * one[i, j] + second * two[i, j]
+            transform[i, 3] += ((i == j) + second * one[i, j] + third * two[i, j]) * xi[j]
+    return transform
+
+
+@compiled
+def se3_log(transform: Floats) -> Floats:
+    """Twist ξ = (ρ, ω) [6] of a transform [4, 4]: the inverse of `se3_exp` for rotations up to π.
+
+    ρ = V⁻¹ t, V⁻¹ = I - W/2 + (1 - θ/(2 tan(θ/2)))/θ² W².
+    """
+    w = so3_log(transform[:3, :3])
+    angle = _length(w)
+    near = angle < 1e-3
+    factor = 1 / 12 + angle**2 / 720 if near else (1 - angle / (2 * math.tan(angle / 2))) / angle**2
+    one, two = hat(w), _hat_squared(w)
+    xi = np.zeros(6)
+    for i in range(3):
+        xi[3 + i] = w[i]
+        for j in range(3):
+            xi[i] += ((i == j) - one[i, j] / 2 + factor * two[i, j]) * transform[j, 3]
+    return xi
+
+
+@compiled
+def se3_inverse(transform: Floats) -> Floats:
+    """The inverse [4, 4] of a transform: rotation Rᵀ, translation -Rᵀ t."""
+    inverse = np.zeros((4, 4))
+    inverse[3, 3] = 1.0
+    for i in range(3):
+        for j in range(3):
+            inverse[i, j] = transform[j, i]
+            inverse[i, 3] -= transform[j, i] * transform[j, 3]
+    return inverse
+
+
+@compiled
+def se3_product(a: Floats, b: Floats) -> Floats:
+    """The transform [4, 4] that applies `b` first: a b."""
+    product = np.zeros((4, 4))
+    product[3, 3] = 1.0
+    for i in range(3):
+        for j in range(4):
+            total = a[i, 3] if j == 3 else 0.0
+            for k in range(3):
+                total += a[i, k] * b[k, j]
+            product[i, j] = total
+    return product
+
+
+@compiled
+def _length(w: Floats) -> float:
+    return math.sqrt(w[0] * w[0] + w[1] * w[1] + w[2] * w[2])
+
+
+@compiled
+def _hat_squared(w: Floats) -> Floats:
+    """W² = w wᵀ - |w|² I, [3, 3]."""
+    x, y, z = w
+    return np.array(
+        [[-(y * y + z * z), x * y, x * z], [x * y, -(x * x + z * z), y * z], [x * z, y * z, -(x * x + y * y)]]
+    )
+
+
+@compiled
+def _exponential_factors(angle: float) -> tuple[float, float, float]:
+    """Factors sin θ/θ, (1 - cos θ)/θ², (θ - sin θ)/θ³; by their series near 0."""
+    square = angle * angle
+    if angle < 1e-2:
+        return (
+            1 - square / 6 * (1 - square / 20 * (1 - square / 42)),
+            0.5 - square / 24 * (1 - square / 30 * (1 - square / 56)),
+            1 / 6 - square / 120 * (1 - square / 42 * (1 - square / 72)),
+        )
+    half = math.sin(angle / 2) / angle
+    return math.sin(angle) / angle, 2 * half * half, (angle - math.sin(angle)) / (square * angle)

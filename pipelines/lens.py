@@ -145,6 +145,33 @@ def undistorted(camera: Camera) -> bool:
     return camera.distortion_model != "equidistant" and not np.any(camera.distortion)
 
 
+class Radial(NamedTuple):
+    """A model's numbers in one form: g is θ (1 + Σ above θ²ⁱ)/r (fisheye) or (1 + Σ above r²ⁱ)/(1 + Σ below r²ⁱ).
+
+    `tangential` p1, p2; `above` 4 and `below` 3 coefficients, 0 where the model has none; `reach` the largest
+    distance from the centre, at unit depth, for which the model holds.
+    """
+
+    fisheye: bool
+    tangential: tuple[float, float]
+    above: tuple[float, float, float, float]
+    below: tuple[float, float, float]
+    reach: float
+
+
+def radial(camera: Camera) -> Radial:
+    """The distortion's numbers, for code that cannot take a `Camera`.
+
+    Raises:
+        ValueError: a camera without a calibration, or with an unknown model.
+    """
+    lens = _lens_of(camera)
+    p1, p2 = lens.tangential.tolist()
+    a1, a2, a3, a4 = np.pad(lens.above, (0, 4 - len(lens.above))).tolist()
+    b1, b2, b3 = np.pad(lens.below, (0, 3 - len(lens.below))).tolist()
+    return Radial(lens.fisheye, (p1, p2), (a1, a2, a3, a4), (b1, b2, b3), _reach(lens))
+
+
 def _rays(camera: Camera, pixels: Floats) -> tuple[Floats, NDArray[np.bool_]]:
     """Rays (x, y, 1) [n, 3] of pixels [n, 2], and which of them lead to their pixels [n]."""
     lens = _lens_of(camera)

@@ -1,0 +1,1 @@
+"""Semi-direct visual odometry of a camera that looks down (paper C; Forster, Pizzoli, Scaramuzza, ICRA 2014)."""
