@@ -85,7 +85,7 @@ def test_triangulation_is_exact_and_least_squares() -> None:
     np.testing.assert_allclose(TURN @ centre + STEP, 0, atol=1e-15)
     g = unit(TURN @ (depth * f) + STEP)
     assert ep.triangulated(f, g, TURN, centre) == pytest.approx(depth, abs=1e-12)
-    g = unit(g + [0.01, 0.02, -0.01])
+    g = unit(g + np.array([0.01, 0.02, -0.01]))
     solved = np.linalg.lstsq(np.column_stack([f, -TURN.T @ g]), centre, rcond=None)[0][0]
     assert ep.triangulated(f, g, TURN, centre) == pytest.approx(solved, abs=1e-9)
     assert math.isnan(ep.triangulated(f, TURN @ f, TURN, centre))
@@ -207,7 +207,7 @@ def test_search_refuses_what_is_not_there(flight) -> None:
     assert (blank["outcome"] >= ep.Match.NOT_ALIGNED).all()
     short = searched(flight, mu, sigma, limits=ep.Limits(most_steps=3))
     assert (short["outcome"] == ep.Match.TOO_LONG).all()
-    camera, reference, image, turn, step, *_ = flight
+    camera, reference, image, turn, *_ = flight
     optics = pr.optics_of(camera)
     sideways = np.array([5.0, 0.0, 0.0])
     args = (pixels[0, 0], pixels[0, 1], bearings[0], 0, mu[0], 0.1)
