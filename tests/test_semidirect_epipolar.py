@@ -12,7 +12,7 @@ from textured_plane import picture
 from pipelines import lens
 from pipelines.semidirect import epipolar as ep
 from pipelines.semidirect import projection as pr
-from pipelines.semidirect.depth_filter import depth_error, pixel_angle
+from pipelines.semidirect.depth_filter import DepthFilters, Outcome, depth_error, pixel_angle
 
 CAMERAS = {
     "pinhole": lens.pinhole(376, 240, 210.0, model="none"),
@@ -88,7 +88,7 @@ def test_triangulation_is_exact_and_least_squares() -> None:
     g = unit(g + np.array([0.01, 0.02, -0.01]))
     solved = np.linalg.lstsq(np.column_stack([f, -TURN.T @ g]), centre, rcond=None)[0][0]
     assert ep.triangulated(f, g, TURN, centre) == pytest.approx(solved, abs=1e-9)
-    assert math.isnan(ep.triangulated(f, TURN @ f, TURN, centre))
+    assert ep.triangulated(f, TURN @ f, TURN, centre) == math.inf
     assert math.isnan(ep.triangulated(f, unit(TURN @ (-0.5 * f) + STEP), TURN, centre))
 
 
@@ -236,3 +236,41 @@ def test_alignment_recovers_a_shift() -> None:
             assert turns <= 10
     assert len(errors) > 35
     assert np.median(errors) < 0.05
+
+
+def test_filters_converge_on_the_plane_and_wait_while_the_camera_stands() -> None:
+    """Search and filter together: 14 frames of a flight, 30 mm apart, then the bank holds the plane's depths."""
+    camera, n = CAMERAS["pinhole"], 40
+    optics, pixels = pr.optics_of(camera), corners(camera, n, 8)
+    bearings = lens.rays(camera, pixels)
+    bearings /= np.linalg.norm(bearings, axis=1)[:, None]
+    truth, normal = 1.5 / bearings[:, 2], np.array([0.0, 0.0, 1.0])
+    reference = pr.pyramid_of(picture(camera, np.eye(3), np.zeros(3), normal))
+    bank = DepthFilters(np.full(n, 1.8), np.full(n, 0.9), converged_share=1 / 100)
+    record, levels = np.empty((n, len(ep.RECORD))), np.zeros(n, np.int64)
+
+    def look(centre, image):
+        ep.search_bank(
+            optics, reference, image, pixels, bearings, levels, bank.state[0], bank.sigma, np.eye(3), -centre,
+            ep.Limits(), record,
+        )  # fmt: skip
+        bank.update(*ep.measurements(record))
+
+    still = bank.state.copy()
+    bank.state[0] = 1 / truth
+    still[0] = 1 / truth
+    look(np.zeros(3), reference)
+    assert set(record[:, 0]) == {ep.Match.NO_PARALLAX}
+    assert (bank.outcome == Outcome.UNSEEN).all()
+    np.testing.assert_array_equal(bank.state, still)
+    bank.state[0] = 1 / 1.8
+    converged = np.zeros(n, bool)
+    for k in range(1, 15):
+        centre = np.array([0.03 * k, 0.005 * k, 0.0])
+        look(centre, pr.pyramid_of(picture(camera, np.eye(3), centre, normal)))
+        converged |= bank.outcome == Outcome.CONVERGED
+    assert converged.mean() > 0.95
+    off = np.abs(bank.depth / truth - 1)[converged]
+    assert np.median(off) < 0.0005
+    assert np.quantile(off, 0.9) < 0.002
+    assert np.median(bank.ratio[converged]) > 0.6

@@ -41,18 +41,24 @@ STATE = 4
 """Rows of a bank: μ, σ², a, b."""
 
 
+UPDATED, NO_MATCH, CONVERGED, DIVERGED, UNSEEN = range(5)
+
+
 class Outcome(IntEnum):
     """What became of a filter in a frame."""
 
-    UPDATED = 0
-    NO_MATCH = 1
+    UPDATED = UPDATED
+    NO_MATCH = NO_MATCH
     """The search found nothing: b + 1."""
-    CONVERGED = 2
+    CONVERGED = CONVERGED
     """Updated, and σ is now small enough for a map point."""
-    DIVERGED = 3
+    DIVERGED = DIVERGED
     """The state is not finite, or the inverse depth has left (0, z_range]: the filter goes."""
-    UNSEEN = 4
-    """The point is not in this frame; the belief stays as it was."""
+    UNSEEN = UNSEEN
+    """The point is not in this frame, or τ is not below z_range; the belief stays as it was.
+
+    By the formulas such a measurement, of a camera that stands, would count as bad: N(x; μ, τ²) is low everywhere.
+    """
 
 
 class Belief(NamedTuple):
@@ -137,8 +143,8 @@ def judged(p: Belief, z_range: float, converged_share: float) -> int:
     """DIVERGED, CONVERGED or UPDATED: what an update has made of a filter."""
     good = p.variance > 0.0 and p.a > 0.0 and p.b > 0.0 and p.mu > 0.0 and p.mu <= z_range
     if not (good and p.variance < math.inf and p.a < math.inf and p.b < math.inf):
-        return 3
-    return 2 if p.variance < (converged_share * z_range) ** 2 else 0
+        return DIVERGED
+    return CONVERGED if p.variance < (converged_share * z_range) ** 2 else UPDATED
 
 
 @_jit
@@ -215,8 +221,8 @@ def update_bank(
     """
     for i in range(state.shape[1]):
         inlier[i] = math.nan
-        if not seen[i]:
-            outcome[i] = 4
+        if not seen[i] or tau[i] >= z_range[i]:
+            outcome[i] = UNSEEN
             continue
         p = Belief(state[0, i], state[1, i], state[2, i], state[3, i])
         if math.isfinite(inverse_depth[i]):
@@ -225,7 +231,7 @@ def update_bank(
             outcome[i] = judged(p, z_range[i], converged_share)
         else:
             p = missed(p)
-            outcome[i] = 1
+            outcome[i] = NO_MATCH
         state[0, i], state[1, i], state[2, i], state[3, i] = p.mu, p.variance, p.a, p.b
 
 

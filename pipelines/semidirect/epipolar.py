@@ -54,7 +54,7 @@ LARGEST_AREA = 3.0
 PARALLEL = 1e-6
 """Rays whose sin² of the angle between them is less than this do not give a depth."""
 
-MATCHED, ALIGNED, UNSEEN, NO_REFERENCE, TOO_LONG, UNLIKE, NOT_ALIGNED, NO_DEPTH = range(8)
+MATCHED, ALIGNED, UNSEEN, NO_REFERENCE, TOO_LONG, UNLIKE, NOT_ALIGNED, NO_PARALLAX, BEHIND = range(9)
 
 
 class Match(IntEnum):
@@ -73,8 +73,10 @@ class Match(IntEnum):
     """The best score is too bad, or the segment's pixels are all outside the image."""
     NOT_ALIGNED = NOT_ALIGNED
     """The alignment did not settle, or left the image."""
-    NO_DEPTH = NO_DEPTH
-    """The rays are parallel, or meet behind a camera."""
+    NO_PARALLAX = NO_PARALLAX
+    """The rays are parallel: the camera has not moved enough."""
+    BEHIND = BEHIND
+    """The rays meet behind a camera."""
 
 
 class Limits(NamedTuple):
@@ -208,7 +210,7 @@ def triangulated(bearing: Floats, other: Floats, rotation: Floats, centre: Float
         centre: of the other camera in the keyframe's axes [3].
 
     Returns:
-        z of min |z f - (c + z' Rᵀg)|; NaN for parallel rays and where they meet behind a camera.
+        z of min |z f - (c + z' Rᵀg)|; inf for parallel rays, NaN where they meet behind a camera.
     """
     g0 = rotation[0, 0] * other[0] + rotation[1, 0] * other[1] + rotation[2, 0] * other[2]
     g1 = rotation[0, 1] * other[0] + rotation[1, 1] * other[1] + rotation[2, 1] * other[2]
@@ -218,7 +220,7 @@ def triangulated(bearing: Floats, other: Floats, rotation: Floats, centre: Float
     gt = g0 * centre[0] + g1 * centre[1] + g2 * centre[2]
     det = 1.0 - fg * fg
     if not det >= PARALLEL:
-        return math.nan
+        return math.inf
     z, behind = (ft - fg * gt) / det, (fg * ft - gt) / det
     return z if z > 0.0 and behind > 0.0 else math.nan
 
@@ -466,8 +468,9 @@ def search(
     over = 1.0 / math.sqrt(a * a + b * b + 1.0)
     centre = centre_in_ref(rotation, translation)
     z = triangulated(bearing, np.array([a * over, b * over, over]), rotation, centre)
-    if not z > 0.0:
-        return Search(NO_DEPTH, s, w, level, steps, best, second, best_u, best_v, turns, fine_u, fine_v, nan, nan, nan)
+    if not math.isfinite(z):
+        end = NO_PARALLAX if z == math.inf else BEHIND
+        return Search(end, s, w, level, steps, best, second, best_u, best_v, turns, fine_u, fine_v, nan, nan, nan)
     tau = depth_error(bearing, centre, z, pixel_angle(optics.focal_u))
     inverse = inverse_depth_error(z, tau)
     return Search(outcome, s, w, level, steps, best, second, best_u, best_v, turns, fine_u, fine_v, z, tau, inverse)
@@ -527,3 +530,13 @@ def search_bank(
         row[14], row[15], row[16], row[17] = w.xx, w.xy, w.yx, w.yy
         row[18], row[19], row[20], row[21], row[22], row[23] = d.level, d.steps, d.best, d.second, d.best_u, d.best_v
         row[24], row[25], row[26], row[27], row[28], row[29] = d.iterations, d.u, d.v, d.depth, d.tau, d.inverse_tau
+
+
+def measurements(record: Floats) -> tuple[Floats, Floats, NDArray[np.bool_]]:
+    """What `DepthFilters.update` takes of a bank's record: inverse depths, τ (NaN without a match), seen, each [n].
+
+    A camera that has not moved has seen nothing: that is no fault of the corner.
+    """
+    outcome = record[:, 0]
+    depth, tau = record[:, RECORD.index("depth")], record[:, RECORD.index("inverse_tau")]
+    return 1.0 / depth, tau.copy(), (outcome != UNSEEN) & (outcome != NO_PARALLAX)
