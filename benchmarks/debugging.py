@@ -52,7 +52,7 @@ def make_recording(folder: Path, frames: int) -> float:
     with (folder / "rgb.txt").open("w") as images, (folder / "groundtruth.txt").open("w") as poses:
         for k in range(frames):
             at = min(k % period, period - k % period)
-            x, y, heading = mission.truth_poses[at]
+            x, y, heading = map(float, mission.truth_poses[at])
             t = f"{START_S + k / RATE_HZ:.6f}"
             images.write(f"{t} rgb/{at}.jpg\n")
             poses.write(f"{t} {x!r} {y!r} 0 0 0 {math.sin(heading / 2)!r} {math.cos(heading / 2)!r}\n")

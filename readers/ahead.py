@@ -13,7 +13,7 @@ from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import lru_cache
-from typing import Generic, TypeVar
+from typing import Any, Generic, TypeVar
 
 Key = TypeVar("Key")
 Value = TypeVar("Value")
@@ -35,15 +35,22 @@ class Ahead(Generic[Key, Value]):
         load: unpacks one block; it runs in a thread, and what it raises comes out of `take`.
         blocks: the keys, each with the bytes that its result takes.
         pause_s: how long it must take, from one block to the asking for the next one, for others to be begun.
+        running: takes up what is being unpacked, so that who closes the file can wait for it (`settle`) even when this
+            object was given up half way.
     """
 
     def __init__(
-        self, load: Callable[[Key], Value], blocks: Iterable[tuple[Key, int]], pause_s: float = WORTH_A_THREAD_S
+        self,
+        load: Callable[[Key], Value],
+        blocks: Iterable[tuple[Key, int]],
+        pause_s: float = WORTH_A_THREAD_S,
+        running: set[Future[Any]] | None = None,
     ) -> None:
         self._load = load
         self._coming = deque(blocks)
         self._begun: dict[Key, tuple[Future[Value], int]] = {}
         self._pause_s = pause_s
+        self._running = set[Future[Any]]() if running is None else running
         self._given_s = float("inf")
 
     def take(self, key: Key) -> Value:
@@ -64,7 +71,10 @@ class Ahead(Generic[Key, Value]):
             if self._begun and size + sum(begun for _, begun in self._begun.values()) > AHEAD_BYTES:
                 return
             self._coming.popleft()
-            self._begun[key] = _threads().submit(self._load, key), size
+            future = _threads().submit(self._load, key)
+            self._running.add(future)
+            future.add_done_callback(self._running.discard)
+            self._begun[key] = future, size
 
     def stop(self) -> None:
         """Unpack nothing more, and wait for what is being unpacked: afterwards nobody reads the file."""
@@ -72,3 +82,8 @@ class Ahead(Generic[Key, Value]):
         begun = [future for future, _ in self._begun.values()]
         self._begun.clear()
         wait([future for future in begun if not future.cancel()])
+
+
+def settle(running: set[Future[Any]]) -> None:
+    """Cancel what has not begun, and wait for the rest: afterwards nobody reads the file."""
+    wait([future for future in list(running) if not future.cancel()])

@@ -13,18 +13,18 @@ import struct
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
+from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import partial
 from itertools import islice, permutations
 from operator import gt, itemgetter
 from pathlib import Path
 from typing import Any, NamedTuple
-from weakref import WeakSet
 
 import numpy as np
 from numpy.typing import NDArray
 
-from readers.ahead import WORTH_A_THREAD_S, Ahead
+from readers.ahead import WORTH_A_THREAD_S, Ahead, settle
 from readers.message_log import Buffer, Channel, DamagedBlockError, Message, MessageLog, Source, inflate, text
 from readers.salvage import Cause, Loss, Tally
 from readers.streams import RecordingError
@@ -336,7 +336,7 @@ class Ros1Log(MessageLog):
         self._latest: tuple[Chunk | None, list[Message]] = (None, [])
         self._kept: dict[Chunk, Buffer] = {}
         self._told: set[tuple[str, int]] = set()
-        self._aheads: WeakSet[Ahead[Chunk, Buffer]] = WeakSet()
+        self._running: set[Future[Any]] = set()
         if self._data[: len(MAGIC)] != MAGIC:
             raise RecordingError(path, "it is no ROS 1 bag of format 2.0", "check that the file is complete")
         header = self._bag_header()
@@ -643,8 +643,7 @@ class Ros1Log(MessageLog):
                 chosen.append(chunk)
         packed = [(chunk, chunk.record.u32(b"size")) for chunk in chosen if chunk.packed]
         slow = any(chunk.record.fields[b"compression"] == b"bz2" for chunk, _ in packed)
-        ahead = Ahead(self._unpacked, packed, 0.0 if slow else WORTH_A_THREAD_S)
-        self._aheads.add(ahead)
+        ahead = Ahead(self._unpacked, packed, 0.0 if slow else WORTH_A_THREAD_S, self._running)
         low, high = start_ns or 0, stop_ns if stop_ns is not None else _END_OF_TIME
         for chunk in chosen:
             select = partial(self._select, chunk, wanted, low, high, ahead)
@@ -675,8 +674,7 @@ class Ros1Log(MessageLog):
 
     def close(self) -> None:
         """Release the file; the system does so when the last message of it is gone."""
-        for ahead in list(self._aheads):
-            ahead.stop()
+        settle(self._running)
         self._latest = (None, [])
         self._kept.clear()
         self._chunks = []

@@ -2,10 +2,11 @@
 
 import threading
 import time
+from concurrent.futures import Future
 
 import pytest
 
-from readers.ahead import AHEAD_BLOCKS, AHEAD_BYTES, Ahead
+from readers.ahead import AHEAD_BLOCKS, AHEAD_BYTES, Ahead, settle
 
 
 def test_every_block_comes_once_and_no_more_are_begun_than_allowed() -> None:
@@ -73,3 +74,25 @@ def test_blocks_are_begun_only_where_there_is_work_to_hide_them_behind(pause_s: 
     ahead.take(1)
     assert (ahead.take(2) != threading.get_ident()) is ahead_too
     ahead.stop()
+
+
+def test_what_was_given_up_half_way_is_settled_before_the_file_is_closed() -> None:
+    slow, done = threading.Event(), []
+
+    def load(key: str) -> str:
+        slow.wait(0.01 if key in "ab" else 0.3)
+        done.append(key)
+        return key
+
+    running: set[Future[str]] = set()
+    ahead = Ahead(load, [(key, 1) for key in "abcdefgh"], 0.0, running)
+    ahead.take("a")
+    ahead.take("b")
+    assert running
+    del ahead
+    settle(running)
+    count = len(done)
+    assert not running
+    slow.set()
+    time.sleep(0.05)
+    assert len(done) == count  # nothing goes on behind the back of who closed the file
