@@ -85,9 +85,10 @@ def test_what_was_given_up_half_way_is_settled_before_the_file_is_closed() -> No
         return key
 
     running: set[Future[str]] = set()
-    ahead = Ahead(load, [(key, 1) for key in "abcdefgh"], 0.0, running)
-    ahead.take("a")
-    ahead.take("b")
+    keys = list("abcdefgh")
+    ahead = Ahead(load, [(key, 1) for key in keys], 0.0, running)
+    ahead.take(keys[0])
+    ahead.take(keys[1])
     assert running
     del ahead
     settle(running)
