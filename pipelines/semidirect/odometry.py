@@ -264,7 +264,8 @@ class SemidirectOdometry:
     ) -> Met:
         """The first map, in metres where the height is known."""
         s, number = self._settings, _number(state, sample)
-        assert self._tracker is not None and self._mapper is not None
+        assert self._tracker is not None
+        assert self._mapper is not None
         place, heading = (s.start_pose[0], s.start_pose[1]), s.start_pose[2]
         if state.held is not None:  # a new map goes on from where the last one was lost
             x, y, heading = self._pose(state.held)
@@ -316,8 +317,10 @@ class SemidirectOdometry:
 
     def _followed(self, state: SemidirectState, sample: ImageSample, pyramid: Pyramid, clock: _Stopwatch) -> Met:
         """Track a frame by the last one."""
-        assert self._tracker is not None and state.last is not None and state.world is not None
+        assert self._tracker is not None
         state = self._caught_up(state)
+        assert state.world is not None
+        assert state.last is not None
         dt_s = (sample.t_ns - state.last.t_ns) * 1e-9
         prior = STILL
         if self._settings.prior == "constant-velocity" and state.motion is not None:
@@ -356,7 +359,9 @@ class SemidirectOdometry:
         clock: _Stopwatch,
     ) -> Met:
         """Give a frame whose pose was found to the mapping; the state after both."""
-        assert state.world is not None and state.last is not None and self._mapper is not None
+        assert state.world is not None
+        assert state.last is not None
+        assert self._mapper is not None
         number = _number(state, sample)
         points, looked = state.world.points, tracked.looked
         posed = Posed(
@@ -416,7 +421,9 @@ class SemidirectOdometry:
         s = self._settings
         if state.scale.known or not (s.speed_stream or s.position_stream):
             return state
-        assert state.held is not None and state.world is not None and state.last is not None
+        assert state.held is not None
+        assert state.world is not None
+        assert state.last is not None
         watch = state.watch.went(t_ns, centre_of(state.held))
         found = watch.scale(way=s.scale_way, speed_sigma_mps=s.speed_sigma_mps, position_sigma_m=s.position_sigma_m)
         if found is None:
@@ -451,10 +458,10 @@ class SemidirectOdometry:
 
     def _searched(self, state: SemidirectState, sample: ImageSample, pyramid: Pyramid, clock: _Stopwatch) -> Met:
         """Look for a lost camera by the keyframes; begin a new map when that has failed for long."""
-        assert self._tracker is not None and state.world is not None and state.last is not None
-        s = self._settings
-        state = self._caught_up(state)
-        assert state.world is not None and state.last is not None
+        assert self._tracker is not None
+        s, state = self._settings, self._caught_up(state)
+        assert state.world is not None
+        assert state.last is not None
         found = relocalised(self._tracker, state.world, pyramid, state.last.cam_t_world, s.relocalise_correlation)
         clock.lap(3)
         fields = _search_fields(found, state.world)
@@ -494,9 +501,9 @@ class SemidirectOdometry:
         continues = before.held is not None and state.map_number == before.map_number
         increment = pose[:2] - was[:2] if continues else np.zeros(2)
         path = _between(before.held, state.held) if continues else 0.0
-        known = state.held is not None
-        place = centre_of(state.held) if known else np.array([*self._settings.start_pose[:2], math.nan])
-        quat = quat_of(state.held) if known else np.full(4, math.nan)
+        place, quat = np.array([*self._settings.start_pose[:2], math.nan]), np.full(4, math.nan)
+        if state.held is not None:
+            place, quat = centre_of(state.held), quat_of(state.held)
         width, height = state.size[1], state.size[0]
         common = {
             "frame": number,

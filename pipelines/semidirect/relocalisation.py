@@ -31,8 +31,10 @@ TRIED = 3
 
 
 class Relocalised(NamedTuple):
-    """What came of a try: the keyframe's frame number (-1 without a map), the correlation of the small images in the
-    end (NaN without), and the frame as it was tracked from there, None where it did not come so far.
+    """What came of a try.
+
+    The `keyframe`'s frame number, -1 where none was alike; the `correlation` of the small images, NaN without; and
+    the frame as it was `tracked` from there, None where it did not come so far.
     """
 
     keyframe: int

@@ -19,8 +19,10 @@ MAP_SIGMA = 0.002
 
 
 class ScaleWatch(NamedTuple):
-    """Rows since the map was begun: (t_ns, x, y, z) of the `camera`, in units of the map; (t_ns, m/s) of the `speed`;
-    (t_ns, x, y, z) of metric `positions`; the camera's `way` in the map.
+    """What was gathered since the map was begun.
+
+    Times (ns) with places [3] of the `camera` in units of the map, with its `speed` (m/s), and with metric
+    `positions` [3]; the camera's `way` in the map.
     """
 
     camera: tuple[tuple[int, Floats], ...] = ()

@@ -53,8 +53,8 @@ class CameraSettings(BaseModel):
         size = self.image_size_px or (width_px, height_px)
         if size != (width_px, height_px):
             raise ValueError(
-                f"the calibration is for {size[0]} x {size[1]} px, the images are {width_px} x {height_px} px: give --camera for "
-                "these images, or --scale-camera if they were resized"
+                f"the calibration is for {size[0]} x {size[1]} px, the images are {width_px} x {height_px} px: give "
+                "--camera for these images, or --scale-camera if they were resized"
             )
         centre = self.centre_px or ((width_px - 1) / 2, (height_px - 1) / 2)
         matrix = np.array([[self.focal_px, 0, centre[0]], [0, self.focal_y_px or self.focal_px, centre[1]], [0, 0, 1]])
