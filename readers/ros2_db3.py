@@ -55,6 +55,7 @@ class SqliteLog(MessageLog):
         self._readable = path
         self._pages: Pages | None = None
         self._found: list[Found] = []
+        self._table = "messages"
         self._size = path.stat().st_size
         self._database = self._connect()
         try:
@@ -83,9 +84,10 @@ class SqliteLog(MessageLog):
         )
         return sqlite3.connect(self._readable, check_same_thread=False)
 
+    _SUM = "sum(timestamp % 1000003 * (id % 1009))"
     _COUNT = (
         "SELECT topic_id, typeof(timestamp) = 'integer', data IS NULL, count(*),"
-        " min(timestamp), max(timestamp) FROM messages GROUP BY 1, 2, 3"
+        f" min(timestamp), max(timestamp), {_SUM} FROM messages GROUP BY 1, 2, 3"
     )
 
     def _cut(self) -> str:
@@ -105,11 +107,15 @@ class SqliteLog(MessageLog):
         try:
             self._read_tables()
             counted = list(self._database.execute(self._COUNT))
+            fault = self._index_fault(sum(row[3] for row in counted), sum(row[-1] or 0 for row in counted))
         except (sqlite3.DatabaseError, UnicodeDecodeError, TypeError) as error:
             self._read_pages(str(error), listed=False)
             return
+        if fault:
+            self._read_pages(fault, listed=False)
+            return
         strangers = 0
-        for number, timed, empty, count, first_ns, last_ns in counted:
+        for number, timed, empty, count, first_ns, last_ns, _ in counted:
             channel = self._by_id.get(number)
             if channel is None:
                 strangers += count
@@ -120,6 +126,28 @@ class SqliteLog(MessageLog):
             else:
                 channel.count, channel.first_ns, channel.last_ns = count, first_ns, last_ns
         self._judge_strangers(strangers)
+
+    def _index_fault(self, messages: int, total: int) -> str:
+        """Compare the index of times with the table: its number of `messages`, and their `total` by `_SUM`.
+
+        An index that differs is not used; one that has more messages than the table is a fault of that, told in words.
+        """
+        listed = self._database.execute("SELECT name FROM pragma_index_list('messages')")
+        columns = "SELECT name FROM pragma_index_info(?)"
+        names = [n for (n,) in list(listed) if [c for (c,) in self._database.execute(columns, (n,))] == ["timestamp"]]
+        for name in names:
+            quoted = name.replace('"', '""')
+            try:
+                query = f'SELECT count(*), {self._SUM} FROM messages INDEXED BY "{quoted}"'
+                count, found = self._database.execute(query).fetchone()
+            except sqlite3.DatabaseError:
+                count, found = 0, None
+            if count > messages:
+                return f"the index of times names {count} messages, the table holds {messages}"
+            if (count, found or 0) != (messages, total):
+                self._table = "messages NOT INDEXED"
+                self._harm(Cause.ORDER, "the index of times differs from the messages, which are read without it")
+        return ""
 
     def _judge_strangers(self, count: int) -> None:
         if count:
@@ -166,7 +194,7 @@ class SqliteLog(MessageLog):
         """A query for messages of some topics in a range of time; the plain one lets SQLite skip other rows soonest."""
         which = "" if len(numbers) == len(self._by_id) else f"topic_id IN ({', '.join('?' * len(numbers))}) AND "
         return (
-            f"SELECT {columns} FROM messages WHERE {which}timestamp >= ? AND timestamp < ?"
+            f"SELECT {columns} FROM {self._table} WHERE {which}timestamp >= ? AND timestamp < ?"
             " AND typeof(timestamp) = 'integer' AND data IS NOT NULL"
         )
 

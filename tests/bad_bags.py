@@ -43,6 +43,11 @@ def entries(store: Any) -> list[Entry]:
     return found
 
 
+def few_entries(store: Any) -> list[Entry]:
+    """A log of a few kB."""
+    return [entry for entry in entries(store) if entry.topic != "/odom"][:33]
+
+
 # ----------------------------------------------------------------------------------- ROS 1
 
 
