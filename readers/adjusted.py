@@ -64,7 +64,7 @@ def _cameras(recording: Recording, options: ReadOptions) -> tuple[dict[str, Came
             notes += calibration.notes
     if options.scale_cameras:
         for topic, camera in (recording.cameras | found).items():
-            size = _image_size(recording, topic)
+            size = image_size(recording, topic)
             if camera.calibrated and size is not None and size != (camera.width_px, camera.height_px):
                 try:
                     found[topic] = scaled(camera, *size)
@@ -94,8 +94,8 @@ def _topics_of(recording: Recording, file: CameraFile, images: list[str]) -> lis
     return matching
 
 
-def _image_size(recording: Recording, topic: str) -> tuple[int, int] | None:
-    """Width and height of the first image of a stream, None where none can be told."""
+def image_size(recording: Recording, topic: str) -> tuple[int, int] | None:
+    """Width and height in px of the first image of a stream, None where none can be told."""
     for sample in itertools.islice(recording.read([topic]), FIRST_IMAGES):
         if isinstance(sample, ImageSample):
             if sample.width_px:
