@@ -297,5 +297,10 @@ def text(raw: Buffer) -> str:
 
 
 def name(raw: Buffer) -> str:
-    """Decode a name; control characters come out as backslash escapes too, so that it can be shown anywhere."""
-    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text(raw))
+    """Decode a name, `escaped`."""
+    return escaped(text(raw))
+
+
+def escaped(given: str) -> str:
+    """A name whose control characters are backslash escapes, so that it can be shown anywhere."""
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), given)

@@ -21,7 +21,7 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from readers.message_log import Channel, Message, MessageLog, Source
+from readers.message_log import Channel, Message, MessageLog, Source, escaped
 from readers.salvage import Cause, Loss, Tally
 from readers.sqlite_pages import BrokenRowError, Pages, Row
 from readers.streams import RecordingError
@@ -135,8 +135,8 @@ class SqliteLog(MessageLog):
         listed = self._database.execute("SELECT name FROM pragma_index_list('messages')")
         columns = "SELECT name FROM pragma_index_info(?)"
         names = [n for (n,) in list(listed) if [c for (c,) in self._database.execute(columns, (n,))] == ["timestamp"]]
-        for name in names:
-            quoted = name.replace('"', '""')
+        for index in names:
+            quoted = index.replace('"', '""')
             try:
                 query = f'SELECT count(*), {self._SUM} FROM messages INDEXED BY "{quoted}"'
                 count, found = self._database.execute(query).fetchone()
@@ -169,7 +169,8 @@ class SqliteLog(MessageLog):
     def _describe(self, topics: Iterable[tuple[Any, ...]], definitions: dict[str, tuple[str, str]]) -> None:
         for number, topic, kind, encoding in topics:
             schema_encoding, schema = definitions.get(kind, ("", ""))
-            channel = Channel(str(topic), str(kind), str(encoding), str(schema_encoding), str(schema).encode())
+            names = (escaped(str(given)) for given in (topic, kind, encoding, schema_encoding))
+            channel = Channel(*names, str(schema).encode())
             self._by_id[number] = channel
         self.channels = list(self._by_id.values())
 

@@ -414,6 +414,24 @@ def test_events_stand_where_the_verdict_changes(tmp_path: Path, monkeypatch: pyt
     assert alarms[130][0].startswith("NOT_RIGID, PEAK_AMBIGUOUS: ")
 
 
+def test_the_lag_of_log_time_after_the_stamps_is_a_series(tmp_path: Path) -> None:
+    """Of the samples that have a stamp: 5 ms, 7 ms and one that came before its stamp."""
+    path, second = tmp_path / "sensors.rrd", 1_000_000_000
+    with rrd.SensorWriter(path, recording_id="mission") as writer:
+        for k, lag_ms in enumerate((5, 7, None, -2)):
+            t_ns = (k + 1) * second
+            own = -1 if lag_ms is None else t_ns
+            received_ns = t_ns + 1_000_000 * (lag_ms or 0)
+            sample = ScalarSample(stream="/h", t_ns=t_ns, received_ns=received_ns, header_ns=own, value=1.0)
+            writer.sample(sample, sample)
+        writer.sample(*[ScalarSample(stream="/bare", t_ns=second, received_ns=second, value=2.0)] * 2)
+    (batch,) = (c.to_record_batch() for c in chunks(path, "/sensors/clocks/h", is_static=False))
+    assert [row[0] for row in batch.column("Scalars:scalars").to_pylist()] == [5.0, 7.0, -2.0]
+    assert batch.column("sensor_time").cast("int64").to_pylist() == [second, 2 * second, 4 * second]
+    assert "/sensors/clocks/bare" not in entities(path)
+    assert "Log time after stamp, ms" in view_names(path)
+
+
 def test_the_tables_show_the_matrices() -> None:
     step = list(fake_steps.steps(2))[1]
     (text,) = traces.numbers(traces.columns(CORRELATION, [step]))
