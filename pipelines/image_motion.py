@@ -1,9 +1,9 @@
 """Motion of a whole image from one frame to the next, quickly: enough to compare clocks, not to navigate by.
 
-Corners of the first image are followed into the second one (pyramidal Lucas-Kanade) and a homography is fitted to them
-without the outliers: so a plane moves, however it is seen, and everything in a turn of the camera. Its turn at the image
-centre is that about the optical axis, a downward camera's heading; its shift there is, over the focal length, the turn
-of a forward camera, and the way of a downward one.
+Corners of the first image are followed into the second one (pyramidal Lucas-Kanade) and a homography is fitted to
+them without the outliers: so a plane moves, however it is seen, and everything in a turn of the camera. Its turn at the
+image centre is that about the optical axis, a downward camera's heading; its shift there is, over the focal length, the
+turn of a forward camera, and the way of a downward one.
 """
 
 from __future__ import annotations

@@ -25,7 +25,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from readers.ahead import WORTH_A_THREAD_S, Ahead, settle
-from readers.message_log import Buffer, Channel, DamagedBlockError, Message, MessageLog, Source, inflate, name, text
+from readers.message_log import Buffer, Channel, DamagedBlockError, Message, MessageLog, Source, escaped, inflate, text
 from readers.salvage import Cause, Loss, Tally
 from readers.streams import RecordingError
 
@@ -443,8 +443,8 @@ class Ros1Log(MessageLog):
         """
         number, described = record.u32(b"conn"), fields_of(data[record.start : record.stop])
         channel = Channel(
-            topic=name(record.fields.get(b"topic", b"")),
-            type=name(described.get(b"type", b"")),
+            topic=escaped(text(record.fields.get(b"topic", b""))),
+            type=escaped(text(described.get(b"type", b""))),
             encoding="ros1",
             schema_encoding="ros1msg",
             schema=described.get(b"message_definition", b""),

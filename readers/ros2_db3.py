@@ -169,9 +169,13 @@ class SqliteLog(MessageLog):
     def _describe(self, topics: Iterable[tuple[Any, ...]], definitions: dict[str, tuple[str, str]]) -> None:
         for number, topic, kind, encoding in topics:
             schema_encoding, schema = definitions.get(kind, ("", ""))
-            names = (escaped(str(given)) for given in (topic, kind, encoding, schema_encoding))
-            channel = Channel(*names, str(schema).encode())
-            self._by_id[number] = channel
+            self._by_id[number] = Channel(
+                topic=escaped(str(topic)),
+                type=escaped(str(kind)),
+                encoding=escaped(str(encoding)),
+                schema_encoding=escaped(str(schema_encoding)),
+                schema=str(schema).encode(),
+            )
         self.channels = list(self._by_id.values())
 
     # -------------------------------------------------------------------------------- reading

@@ -256,7 +256,7 @@ def test_a_simulated_missions_clock_offset_and_late_images_are_found(
 
 
 TURNS = "legs = [{turn_rad=0.7,turn_s=1.2},{drive_m=0.5},{turn_rad=-1.1,turn_s=1.7},{turn_rad=0.5,turn_s=0.9}]"
-ROOM = "poster_m = 1.5\nlandmarks_m = [[8,-8,1],[9,-4,1],[9,0,1],[9,4,1],[8,8,1],[7,-6,2.5],[8,-2,2.5],[8,2,2.5],[7,6,2.5]]"
+POSTERS = "[[8,-8,1],[9,-4,1],[9,0,1],[9,4,1],[8,8,1],[7,-6,2.5],[8,-2,2.5],[8,2,2.5],[7,6,2.5]]"
 GROUND_AHEAD = "[ground]\nmetres_per_px = 0.004"
 FORWARD = "focal_px = 120\nwidth_px = 160\nheight_px = 120\ntiming = { rate_hz = 20, clock_offset_s = 0.035 }"
 TILTED = "focal_px = 110\nwidth_px = 160\nheight_px = 160\ntiming = { rate_hz = 25, clock_offset_s = 0.035 }"
@@ -273,7 +273,7 @@ def test_the_clock_of_a_camera_that_does_not_look_straight_down_is_found(
 ) -> None:
     """Its clock is 35 ms ahead of the IMU's."""
     file = tmp_path / "view.toml"
-    sensors = f"[imu]\ntiming = {{ rate_hz = 200 }}\n[surroundings]\n{ROOM}\n"
+    sensors = f"[imu]\ntiming = {{ rate_hz = 200 }}\n[surroundings]\nposter_m = 1.5\nlandmarks_m = {POSTERS}\n"
     file.write_text(f'about = "{name}"\nduration_s = 5\n[trajectory]\n{VIEWS[name]}\n{sensors}')
     status = main(["sync", str(file), "--json"])
     (told,) = json.loads(capsys.readouterr().out)["pairs"]

@@ -4,8 +4,8 @@ Each stream has the entity ``/sensors/streams/STREAM``. What every sample has st
 its class, its place `order` in the order in which all streams came, `received_ns`, the number of a frame. Numbers that
 make a plot are `Scalars`; tracks and landmarks keep theirs in ``Sample:values``. An image's pixels stand at
 ``/camera/image``; only where that picture does not give back the very grey levels that the estimator got, these stand
-at ``/sensors/grey/STREAM`` once more, as PNG. Of messages that have a stamp, ``/sensors/clocks/STREAM`` plots by how much
-log time exceeds it, in ms.
+at ``/sensors/grey/STREAM`` once more, as PNG. Of messages that have a stamp, ``/sensors/clocks/STREAM`` plots by how
+much log time exceeds it, in ms.
 """
 
 from __future__ import annotations
