@@ -1,7 +1,8 @@
 """Recordings of every container mutated at random, and what no reader may do with them.
 
 ``python tests/fuzz_readers.py [--seconds 30] [--seed 1]`` takes the subjects in turn until the time is over. A mutant
-is the same for the same seed, subject and number: ``--only SUBJECT --first NUMBER --count 1`` makes it again.
+is the same for the same seed, subject and number: ``--only SUBJECT --first NUMBER --count 1`` makes it again. One that
+fails is kept; one that hangs is left in its subject's folder, in the place of the sound file.
 """
 
 import argparse
@@ -10,13 +11,12 @@ import itertools
 import math
 import os
 import random
-import resource
 import shutil
 import sys
 import tempfile
 import time
 from collections import Counter
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
@@ -37,7 +37,7 @@ from readers.streams import ImageError, ImageSample, Problem, Recording, Workben
 
 CPU_S, WALL_S = 5.0, 60.0
 """What one mutant may take; at the second one the process is ended, however deep it hangs."""
-MEMORY = 3 << 30
+MEMORY = 2 << 30
 Content = Mapping[str, bytes]
 Read = Counter[tuple[object, ...]]
 
@@ -125,9 +125,9 @@ def plain(message: Message) -> tuple[object, ...]:
     return message.channel.topic, message.log_ns, bytes(message.data)
 
 
-def decode(recording: Recording) -> Iterator[tuple[object, ...]]:
+def decode(recording: Recording) -> list[tuple[object, ...]]:
     """Every sample, the pictures decoded: what each is, or that it tells of its damage."""
-    found = []
+    found: list[tuple[object, ...]] = []
     for sample in recording.read():
         what: object = type(sample).__name__
         if isinstance(sample, ImageSample):
@@ -136,7 +136,7 @@ def decode(recording: Recording) -> Iterator[tuple[object, ...]]:
             except ImageError:
                 what = Problem.__name__
         found.append((sample.stream, what))
-    return iter(found)
+    return found
 
 
 def pictures_of(recording: Recording) -> Outcome:
@@ -385,6 +385,16 @@ def fuzz(subjects: Sequence[Subject], seed: int, numbers: Iterable[int], seconds
     return report
 
 
+def limit_memory() -> None:
+    """Let allocations fail that go `MEMORY` beyond what is taken now, where the system can do so."""
+    taken = Path("/proc/self/statm")
+    if taken.is_file():
+        import resource
+
+        most = int(taken.read_text().split()[0]) * resource.getpagesize() + MEMORY
+        resource.setrlimit(resource.RLIMIT_AS, (most, most))
+
+
 def main() -> int:
     names = [subject.name for subject in SUBJECTS]
     parser = argparse.ArgumentParser(description=__doc__)
@@ -394,7 +404,7 @@ def main() -> int:
     parser.add_argument("--first", type=int, default=0, help="number of the first mutant")
     parser.add_argument("--count", type=int, help="how many mutants of each subject, not the time, end it")
     given = parser.parse_args()
-    resource.setrlimit(resource.RLIMIT_AS, (MEMORY, MEMORY))
+    limit_memory()
     sys.stderr = os.fdopen(os.dup(2), "w")
     os.dup2(os.open(os.devnull, os.O_WRONLY), 2)  # the libraries of image formats write there whatever they meet
     chosen = [subject for subject in SUBJECTS if subject.name in (given.only or names)]
