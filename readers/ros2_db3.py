@@ -132,7 +132,7 @@ class SqliteLog(MessageLog):
 
         An index that differs is not used; one that has more messages than the table is a fault of that, told in words.
         """
-        listed = self._database.execute("SELECT name FROM pragma_index_list('messages')")
+        listed = self._database.execute("SELECT name FROM pragma_index_list('messages') WHERE NOT partial")
         columns = "SELECT name FROM pragma_index_info(?)"
         names = [n for (n,) in list(listed) if [c for (c,) in self._database.execute(columns, (n,))] == ["timestamp"]]
         for index in names:

@@ -167,6 +167,8 @@ def test_a_flipped_bit_gives_nothing_false_where_the_container_can_tell(tmp_path
         found, reported = judge.read(bytes(data))
         false = found - judge.every
         wrong += bool(false)
+        if kind == "bz2":  # what a topic is called also stands outside of the chunks, and is told if it differs
+            assert {message[1:] for message in found} <= {message[1:] for message in judge.every}, place
         if not reported and found != judge.every:
             silent += 1
             assert kind != "bz2", place
@@ -174,6 +176,4 @@ def test_a_flipped_bit_gives_nothing_false_where_the_container_can_tell(tmp_path
                 assert [m[1] for m in sorted(found)] == [m[1] for m in sorted(judge.every)], place
             else:
                 assert {message[:2] for message in found} == judge.outlines, place
-    if kind == "bz2":
-        assert wrong <= 0.01 * len(places)
     print(f"{kind}: {len(places)} flips, {wrong} with wrong data, {silent} unreported")

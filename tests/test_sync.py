@@ -262,7 +262,6 @@ FORWARD = "focal_px = 120\nwidth_px = 160\nheight_px = 120\ntiming = { rate_hz =
 TILTED = "focal_px = 110\nwidth_px = 160\nheight_px = 160\ntiming = { rate_hz = 25, clock_offset_s = 0.035 }"
 VIEWS = {
     "straight ahead": f'curve = "line"\n{TURNS}\n{GROUND_AHEAD}\n[front]\n{FORWARD}',
-    "ahead and down": f'curve = "line"\n{TURNS}\n{GROUND_AHEAD}\n[front]\npitch_rad = 0.5\n{FORWARD}',
     "down, tilted": f'curve = "serpentine"\nspeed_kmh = 4.0\n[camera]\npitch_rad = -0.5\n{TILTED}',
 }
 

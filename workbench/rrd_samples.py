@@ -180,11 +180,10 @@ class SampleLog:
 
     def _lags(self, samples: Sequence[Sample], frames: NDArray[np.int64] | None, t_ns: NDArray[np.int64]) -> None:
         """Log time less header stamp of the samples that have both, ms."""
-        times = np.array([(sample.header_ns, sample.received_ns) for sample in samples], np.int64)
-        stamped = times[:, 0] > 0
-        lags_ms = (times[:, 1] - times[:, 0])[stamped] / 1e6
+        stamped = [sample.header_ns > 0 for sample in samples]
+        lags_ms = [(sample.received_ns - sample.header_ns) / 1e6 for sample in itertools.compress(samples, stamped)]
         entity = entity_of(samples[0].stream, CLOCKS)
-        if len(lags_ms) and entity not in self._named:
+        if lags_ms and entity not in self._named:
             self._named.add(entity)
             self._file.static(entity, rr.SeriesLines(names=[f"{samples[0].stream}: log time - stamp, ms"]))
         columns = rr.Scalars.columns(scalars=lags_ms)
