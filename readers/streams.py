@@ -521,6 +521,39 @@ class Recording(abc.ABC):
         """
         return self.read(streams)
 
+    def array(self, stream: str, start_ns: int | None = None, stop_ns: int | None = None) -> NDArray[np.void]:
+        """The samples of a stream as one structured array, a row for each, in the order of `read`.
+
+        Its columns are those of `readers.sample_arrays`: times in ns, and the fields of the samples with their units in
+        their names. A message that cannot be made a sample has a row with ``readable`` False and NaN. The array is as
+        large as what was asked for; `arrays` gives the same rows piece by piece.
+
+        Args:
+            stream: one of numbers: IMU, odometry, poses, ranges, GNSS, scalars.
+            start_ns: first `t_ns`, None from the begin.
+            stop_ns: end of the half-open range, None to the end.
+
+        Raises:
+            StreamError: as for `read`; or the samples are no rows of numbers, or a time does not fit into 64 bits.
+        """
+        from readers.sample_arrays import joined, row_type
+
+        columns = row_type(self.stream(stream))
+        return joined(self.arrays(stream, start_ns, stop_ns), columns)
+
+    def arrays(
+        self, stream: str, start_ns: int | None = None, stop_ns: int | None = None, *, rows: int = 1 << 12
+    ) -> Iterator[NDArray[np.void]]:
+        """The same rows as `array`, in pieces of about `rows` of them, so that memory is bounded.
+
+        Raises:
+            StreamError: as for `array`.
+        """
+        from readers.sample_arrays import arrays_of, row_type
+
+        columns = row_type(self.stream(stream))
+        return arrays_of(self.read([stream], start_ns, stop_ns), columns, rows)
+
     @property
     def identity(self) -> str:
         """What makes a recording without a file the one that it is; empty where the file itself does."""
