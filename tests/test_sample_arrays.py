@@ -1,6 +1,7 @@
 """One structured array for a stream: its rows are the samples, in any container, and rosbags' own numbers."""
 
 import itertools
+import re
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -218,3 +219,11 @@ def test_what_is_no_row_of_numbers_is_refused(tmp_path: Path) -> None:
         assert isinstance(recording, Recording)
         with pytest.raises(StreamError, match=r"/imu: .* is too large for an array; choose a window without it"):
             recording.array("/imu")
+
+
+def test_the_example_of_the_page_runs(monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> None:
+    root = Path(__file__).parents[1]
+    (block,) = re.findall(r"^```python\n(.*?)^```$", (root / "docs/readers.md").read_text(), re.MULTILINE | re.DOTALL)
+    monkeypatch.chdir(root)
+    exec(compile(block, "readers.md", "exec"), {})
+    assert re.fullmatch(r"300 poses, \d+ heights in the first second, mean \d\.\d{3} m\n", capsys.readouterr().out)
