@@ -13,6 +13,7 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from readers.camera_files import plain_topic, read_camera, read_cameras, scaled
 from readers.clock import merge
+from readers.extras import Extras
 from readers.log_recording import LogRecording
 from readers.sample_arrays import ARRAY_ROWS, StructuredArray
 from readers.streams import (
@@ -167,6 +168,10 @@ class Adjusted(Recording):
     def damage(self) -> tuple[Damage, ...]:
         """What of the file is damaged."""
         return self._inner.damage
+
+    def extras(self) -> Extras:
+        """Attachments and metadata of the log."""
+        return self._inner.extras()
 
     @property
     def identity(self) -> str:

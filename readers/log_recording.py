@@ -19,6 +19,7 @@ import numpy as np
 
 from readers.clock import REORDER_WINDOW_NS, SECOND_NS, merge, reorder, sane_stamp
 from readers.decoding import Decoder, Definitions, MessageError, decoder_of, definition_text
+from readers.extras import Extras
 from readers.fixed_layout import FixedReader, fixed_reader, header_of
 from readers.fixed_rows import fill_rows, read_rows
 from readers.message_log import Buffer, Channel, Message, MessageLog, Source, in_log_order
@@ -347,6 +348,13 @@ class LogRecording(Recording):
     def losses(self) -> tuple[Loss, ...]:
         """What of the files could not be read, as far as they were read by now, in the form that can be counted."""
         return tuple(loss for log in self._logs for loss in log.losses)
+
+    def extras(self) -> Extras:
+        """Attachments and metadata, which MCAP files can have; those that are lost become damage."""
+        found = Extras()
+        for log in self._logs:
+            found.add(log.extras())
+        return found
 
     @property
     def definitions(self) -> Definitions:

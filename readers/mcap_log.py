@@ -18,6 +18,8 @@ from types import MappingProxyType
 import numpy as np
 
 from readers.ahead import WORTH_A_THREAD_S
+from readers.extras import Extras
+from readers.mcap_extras import ExtrasWalk
 from readers.mcap_records import (
     FOOTER,
     HEAD,
@@ -76,6 +78,7 @@ class McapLog(IndexedLog):
         self.told: set[int] = set()
         self._thread: ThreadPoolExecutor | None = None
         self._given_s = 0.0
+        self._extras: Extras | None = None
         try:
             self._open()
         except BaseException:
@@ -432,11 +435,19 @@ class McapLog(IndexedLog):
             span = (block.offset, block.offset + block.size)
             self.report(Cause.CHECKSUM, text, *span, counts, (block.first_ns, block.last_ns))
 
+    def extras(self) -> Extras:
+        """Attachments and metadata; the file is walked over once, from record to record."""
+        if self._extras is None:
+            segment = next((block.segment for block in self._blocks if isinstance(block, McapBlock)), Segment())
+            self._extras = ExtrasWalk(self, segment).run()
+        return self._extras
+
     def close(self) -> None:
         """Release the file; images that are still held keep their part of it."""
         if self._thread is not None:
             self._thread.shutdown(wait=True, cancel_futures=True)
         self._unpacked.clear()
+        self._extras = None
         try:
             self.view.release()
             self._map.close()

@@ -21,6 +21,7 @@ import lz4.frame  # type: ignore[import-untyped, unused-ignore]
 import zstandard
 from isal.isal_zlib import crc32 as crc32
 
+from readers.extras import Extras
 from readers.salvage import Loss
 from readers.streams import Damage
 
@@ -159,6 +160,10 @@ class MessageLog(abc.ABC):
     def count_before(self, channels: Collection[Channel], stop_ns: int) -> int:
         """How many messages of `channels` were logged before `stop_ns`."""
         return sum(1 for source in self.sources(channels, None, stop_ns) for _ in source.open())
+
+    def extras(self) -> Extras:
+        """What the log holds beside its messages; what of it cannot be read becomes a loss."""
+        return Extras()
 
     @abc.abstractmethod
     def close(self) -> None:

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from readers.extras import Extras
     from readers.salvage import Loss
 
 FloatArray = NDArray[np.float64]
@@ -492,6 +493,12 @@ class Recording(abc.ABC):
     def losses(self) -> tuple[Loss, ...]:
         """The damage in the form that can be counted by topic, of logs of messages."""
         return ()
+
+    def extras(self) -> Extras:
+        """Attachments and metadata of the log; reading them may find damage."""
+        from readers.extras import Extras
+
+        return Extras()
 
     @abc.abstractmethod
     def read(

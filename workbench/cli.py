@@ -39,6 +39,7 @@ from workbench.terminal import (
 
 if TYPE_CHECKING:
     from pipelines.simulation.mission import SimulatedMission
+    from readers.extras import Extras, LostExtra
     from readers.streams import Camera, CameraFile, Clock, ReadOptions, Recording, StreamInfo
     from workbench.diagnosis.finding import Finding
     from workbench.reproduce import report as reports_a
@@ -156,7 +157,8 @@ def inspect(
     )
     with open_any(path, options) as recording:
         facts, clocks_found = ([], {}) if quick else _survey(recording)
-        values = _recording_values(recording, facts) | {"clocks": clocks_found} | _lost(recording, quick)
+        beside = {} if quick else _extras_values(recording.extras())
+        values = _recording_values(recording, facts) | {"clocks": clocks_found} | beside | _lost(recording, quick)
         if as_json:
             print_json(values)
         else:
@@ -173,6 +175,20 @@ def _lost(recording: Recording, quick: bool) -> dict[str, Any]:
         return {"loss": None}
     good = {} if quick else loss_report.read_through(recording)
     return {"loss": loss_report.values(good, recording.losses)}
+
+
+def _extras_values(extras: Extras) -> dict[str, Any]:
+    """What lies in a log beside its messages."""
+    attachments = [
+        {"name": one.name, "media_type": one.media_type, "bytes": len(one.data), "log_ns": one.log_ns}
+        for one in extras.attachments
+    ]
+    metadata = [{"name": one.name, "values": one.values} for one in extras.metadata]
+    return {"attachments": attachments, "metadata": metadata, "lost_beside_messages": _lost_extras(extras.lost)}
+
+
+def _lost_extras(lost: Sequence[LostExtra]) -> list[dict[str, str]]:
+    return [{"kind": str(one.kind), "name": one.name, "reason": one.reason} for one in lost]
 
 
 def _survey(recording: Recording) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -257,6 +273,9 @@ def _print_recording(recording: Recording, values: Mapping[str, Any]) -> None:
     _print_clocks(values["clocks"])
     print_list("notes", values["notes"])
     print_list("not readable", [_unreadable(info) for info in recording.streams if not info.readable])
+    beside = [f"{one['name']}, {one['media_type']}, {one['bytes']} bytes" for one in values.get("attachments", ())]
+    print_list("attachments", beside)
+    print_list("metadata", [f"{one['name']}: {len(one['values'])} values" for one in values.get("metadata", ())])
     print_list("damage", values["damage"])
     if values["loss"]:
         _print_losses(values["loss"])
@@ -347,11 +366,16 @@ def recover(
     report = loss_report.values(done.good, done.losses)
     skipped = [{"topic": topic, "count": n, "reason": why} for (topic, why), n in done.skipped.items()]
     if as_json:
-        print_json({"path": str(out), **report, "damage": list(done.damage), "not_written": skipped})
+        counts = {"attachments": done.attachments, "metadata": done.metadata}
+        beside = counts | {"lost_beside_messages": _lost_extras(done.lost)}
+        print_json({"path": str(out), **report, **beside, "damage": list(done.damage), "not_written": skipped})
     else:
-        print(f"{out}: {sum(good.count for good in done.good.values())} messages of {shown(str(path))}")
+        counts = {"attachments": done.attachments, "records of metadata": done.metadata}
+        more = "".join(f", {count} {what}" for what, count in counts.items() if count)
+        print(f"{out}: {sum(good.count for good in done.good.values())} messages{more} of {shown(str(path))}")
         _print_losses(report)
-        print_list("not written", [f"{one['topic']}: {one['count']} messages: {one['reason']}" for one in skipped])
+        not_written = [f"{one['topic']}: {one['count']} messages: {one['reason']}" for one in skipped]
+        print_list("not written", [*not_written, *(f"{one.kind} {one.name}: {one.reason}" for one in done.lost)])
         print_list("damage", done.damage)
     if not done.clean:
         raise typer.Exit(IN_PART)
