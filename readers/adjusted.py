@@ -169,6 +169,11 @@ class Adjusted(Recording):
         """What of the file is damaged."""
         return self._inner.damage
 
+    @property
+    def cache_troubles(self) -> tuple[str, ...]:
+        """What was wrong with the cache of indexes."""
+        return self._inner.cache_troubles
+
     def extras(self) -> Extras:
         """Attachments and metadata of the log."""
         return self._inner.extras()

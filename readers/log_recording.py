@@ -349,6 +349,11 @@ class LogRecording(Recording):
         """What of the files could not be read, as far as they were read by now, in the form that can be counted."""
         return tuple(loss for log in self._logs for loss in log.losses)
 
+    @property
+    def cache_troubles(self) -> tuple[str, ...]:
+        """What was wrong with the cache of indexes, one sentence each."""
+        return tuple(log.cached.trouble for log in self._logs if log.cached is not None and log.cached.trouble)
+
     def extras(self) -> Extras:
         """Attachments and metadata, which MCAP files can have; those that are lost become damage."""
         found = Extras()

@@ -19,6 +19,8 @@ import numpy as np
 
 from readers.ahead import WORTH_A_THREAD_S
 from readers.extras import Extras
+from readers.index_cache import Entry, State
+from readers.index_states import mcap_state, put_mcap
 from readers.mcap_extras import ExtrasWalk
 from readers.mcap_records import (
     FOOTER,
@@ -65,8 +67,8 @@ class McapLog(IndexedLog):
         RecordingError: the file does not begin like an MCAP file.
     """
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, "MCAP")
+    def __init__(self, path: Path, cached: Entry | None = None) -> None:
+        super().__init__(path, "MCAP", cached)
         if not path.stat().st_size:
             raise RecordingError(path, "the file is empty (0 bytes)", "record or copy it again")
         with path.open("rb") as file:
@@ -92,11 +94,18 @@ class McapLog(IndexedLog):
         fault = self._read_summary(segment)
         if fault is None:
             self._find_edges()
-        else:
+        elif not self.recall(self._put):
+            begun = time.perf_counter()
             self._blocks.clear()
             Scan(self, segment, fault).run()
+            blocks = [block for block in self._blocks if isinstance(block, McapBlock)]
+            if self.cached is not None:
+                self.keep(mcap_state(self, blocks), time.perf_counter() - begun)
         if segment.profile:
             self.format = f"MCAP, profile {segment.profile}"
+
+    def _put(self, state: State) -> None:
+        self._blocks = [*put_mcap(self, state)]
 
     def profile(self, start: int) -> str:
         """The profile of the file that begins at `start`, "" if its header is damaged."""
@@ -343,7 +352,7 @@ class McapLog(IndexedLog):
         while len(self._unpacked) > kept:
             self._unpacked.popitem(last=False)
         self._given_s = time.perf_counter()
-        if unpacked.faults and block.offset not in self.told:
+        if unpacked.faults and (unpacked.withheld or block.offset not in self.told):
             self.told.add(block.offset)
             self._report_block(block, unpacked)
         return unpacked

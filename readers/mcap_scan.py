@@ -221,7 +221,8 @@ class Scan:
             stated = Stated(head.compression, head.stop - head.start, head.unpacked_bytes)
         block = McapBlock(start, end - start, 0, 0, {}, torn, segment=self.segment, chunk=chunk, stated=stated)
         unpacked = self.log.unpack(block)
-        self.log.told.add(start)
+        if unpacked.faults:
+            self.log.told.add(start)
         if unpacked.withheld:
             counts, times = self._listed(end)
             self.cost.update(counts)

@@ -13,6 +13,7 @@ import mmap
 import re
 import shutil
 import sqlite3
+import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from functools import partial
@@ -21,6 +22,8 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
+from readers.index_cache import Entry
+from readers.index_states import Counted, db3_counted, db3_state
 from readers.message_log import Channel, Message, MessageLog, Source
 from readers.salvage import Cause, Loss, Tally
 from readers.sqlite_pages import BrokenRowError, Pages, Row
@@ -48,8 +51,8 @@ class SqliteLog(MessageLog):
         RecordingError: no database of a ROS 2 bag, or one of which nothing can be read.
     """
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, "ROS 2 bag, sqlite3")
+    def __init__(self, path: Path, cached: Entry | None = None) -> None:
+        super().__init__(path, "ROS 2 bag, sqlite3", cached)
         self._by_id: dict[int, Channel] = {}
         self._copy: TemporaryDirectory[str] | None = None
         self._readable = path
@@ -104,7 +107,7 @@ class SqliteLog(MessageLog):
             return
         try:
             self._read_tables()
-            counted = list(self._database.execute(self._COUNT))
+            counted = self._counts()
         except (sqlite3.DatabaseError, UnicodeDecodeError, TypeError) as error:
             self._read_pages(str(error), listed=False)
             return
@@ -120,6 +123,17 @@ class SqliteLog(MessageLog):
             else:
                 channel.count, channel.first_ns, channel.last_ns = count, first_ns, last_ns
         self._judge_strangers(strangers)
+
+    def _counts(self) -> Counted:
+        """What `_COUNT` gives; the query passes over all rows, so its answer is kept unless a log lies beside."""
+        found: Counted = []
+        if self._copy is not None:
+            self.cached = None
+        if not self.recall(lambda state: found.extend(db3_counted(state))):
+            begun = time.perf_counter()
+            found = list(self._database.execute(self._COUNT))
+            self.keep(db3_state(found), time.perf_counter() - begun)
+        return found
 
     def _judge_strangers(self, count: int) -> None:
         if count:

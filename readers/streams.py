@@ -365,7 +365,8 @@ class ReadOptions:
     topic and what is added to the times of its samples. `cameras` are the files of calibrations that take the place of
     the recording's own; `scale_cameras` has calibrations of another image size scaled to the images. Definitions that a
     log does not have come from the ROS 2 `distribution` (``humble``; the latest if empty), then from the ``.msg`` files
-    of `msg_folder`.
+    of `msg_folder`. `cache` allows a log without a usable index to be opened by what an earlier opening found, see
+    `readers.index_cache`.
     """
 
     rate_hz: float | None = None
@@ -378,6 +379,7 @@ class ReadOptions:
     scale_cameras: bool = False
     distribution: str = ""
     msg_folder: Path | None = None
+    cache: bool = True
 
     def clock_of(self, topic: str) -> Clock:
         """The clock of a topic."""
@@ -492,6 +494,11 @@ class Recording(abc.ABC):
     @property
     def losses(self) -> tuple[Loss, ...]:
         """The damage in the form that can be counted by topic, of logs of messages."""
+        return ()
+
+    @property
+    def cache_troubles(self) -> tuple[str, ...]:
+        """What was wrong with the cache of indexes, one sentence each; the recording is the same without it."""
         return ()
 
     def extras(self) -> Extras:

@@ -111,6 +111,9 @@ MsgFolder = Annotated[
 Distribution = Annotated[
     str, typer.Option("--distro", metavar="NAME", help="ROS 2 distribution of types that the log does not define.")
 ]
+NoCache = Annotated[
+    bool, typer.Option("--no-cache", help="Walk over a log without an index anew; see docs/readers.md.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 
 
@@ -148,14 +151,26 @@ def inspect(
     scale_camera: ScaleCamera = False,
     msg: MsgFolder = None,
     distro: Distribution = "",
+    no_cache: NoCache = False,
 ) -> None:
     """Show what is in a recording: streams, cameras, damage, and what is odd about its clocks."""
     from workbench.session import open_any
 
     options = _options(
-        rate, times, times_unit, tf, clocks, offsets, cameras, scale_camera, msg=msg, distribution=distro
+        rate,
+        times,
+        times_unit,
+        tf,
+        clocks,
+        offsets,
+        cameras,
+        scale_camera,
+        msg=msg,
+        distribution=distro,
+        cache=not no_cache,
     )
     with open_any(path, options) as recording:
+        _warn(recording.cache_troubles)
         facts, clocks_found = ([], {}) if quick else _survey(recording)
         beside = {} if quick else _extras_values(recording.extras())
         values = _recording_values(recording, facts) | {"clocks": clocks_found} | beside | _lost(recording, quick)
@@ -343,6 +358,7 @@ def recover(
     out: Annotated[Path, typer.Option("--out", "-o", metavar="OUT.mcap", help="File to write; it must not exist.")],
     msg: MsgFolder = None,
     distro: Distribution = "",
+    no_cache: NoCache = False,
     as_json: AsJson = False,
 ) -> None:
     """Write the readable messages of a log, as they are stored, into an MCAP file with an index; tell what was lost.
@@ -354,10 +370,9 @@ def recover(
     from workbench.recovery import recover as write
     from workbench.session import Progress, open_any
 
-    with (
-        open_any(path, _options(None, None, "auto", None, msg=msg, distribution=distro)) as recording,
-        Bar(out.name, "message") as bar,
-    ):
+    options = _options(None, None, "auto", None, msg=msg, distribution=distro, cache=not no_cache)
+    with open_any(path, options) as recording, Bar(out.name, "message") as bar:
+        _warn(recording.cache_troubles)
         try:
             done = write(recording, out, on_progress=lambda done, total: bar(Progress(done, total, 0)))
         except KeyboardInterrupt:
@@ -465,6 +480,7 @@ def replay(
     scale_camera: ScaleCamera = False,
     msg: MsgFolder = None,
     distro: Distribution = "",
+    no_cache: NoCache = False,
     as_json: AsJson = False,
 ) -> None:
     """Replay a recording through an estimator; write all it computed, and a summary.
@@ -495,7 +511,17 @@ def replay(
         reference_offset_s=reference_offset,
         height=height,
         options=_options(
-            rate, times, times_unit, tf, clocks, offsets, cameras, scale_camera, msg=msg, distribution=distro
+            rate,
+            times,
+            times_unit,
+            tf,
+            clocks,
+            offsets,
+            cameras,
+            scale_camera,
+            msg=msg,
+            distribution=distro,
+            cache=not no_cache,
         ),
         calibrate=calibrate,
         smooth=smooth,
@@ -535,7 +561,7 @@ def _replay(request: Request, recording: Recording | None = None) -> Outcome:
 
 
 def _warn(texts: Sequence[str]) -> None:
-    """Tell what is odd about the clocks before the estimator runs."""
+    """Tell what is odd about the clocks, or the cache of indexes, before the work begins."""
     for text in texts:
         print(f"warning: {shown(text)}", file=sys.stderr, flush=True)
 
@@ -795,6 +821,7 @@ def sync(
     picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the correlations.")] = None,
     clocks: Clocks = None,
     offsets: Offsets = None,
+    no_cache: NoCache = False,
     as_json: AsJson = False,
 ) -> None:
     """Tell by how much the times of each camera are to be moved to fit each IMU and odometer, and how surely.
@@ -809,7 +836,9 @@ def sync(
 
     if not 0 < max_offset < float("inf"):
         raise StreamError(f"--max-offset {max_offset:g}: give a positive number of seconds")
-    with open_any(path, _options(None, None, "auto", None, clocks, offsets)) as recording, Bar("sync") as bar:
+    options = _options(None, None, "auto", None, clocks, offsets, cache=not no_cache)
+    with open_any(path, options) as recording, Bar("sync") as bar:
+        _warn(recording.cache_troubles)
         pairs = estimated(
             recording,
             images=images or (),
@@ -1223,6 +1252,7 @@ def _options(
     *,
     msg: Path | None = None,
     distribution: str = "",
+    cache: bool = True,
 ) -> ReadOptions:
     from readers.streams import ReadOptions, StreamError
 
@@ -1247,6 +1277,7 @@ def _options(
         scale_cameras=scale_camera,
         distribution=distribution,
         msg_folder=msg,
+        cache=cache,
     )
 
 
