@@ -138,10 +138,12 @@ class Entry:
         self.used = False
         self.trouble = f"The cached index {self.file} was not used: {reason}; the file was read anew."
 
-    def save(self, state: State, taken_s: float) -> None:
-        """Keep what opening found in `taken_s` seconds, if that was long, and the file is the one that was opened."""
-        if taken_s < WORTH_KEEPING_S and not self.trouble:
-            return
+    def worth(self, taken_s: float) -> bool:
+        """Whether what took `taken_s` seconds to find is to be kept; an entry that was damaged is always replaced."""
+        return taken_s >= WORTH_KEEPING_S or bool(self.trouble)
+
+    def save(self, state: State) -> None:
+        """Keep what opening found, unless the file has changed meanwhile."""
         try:
             if key_of(self.log) != self._key:
                 return
@@ -149,7 +151,8 @@ class Entry:
             _write(self.file, {"key": self._key, "state": state})
             _shrink(self.folder)
         except OSError as error:
-            self.trouble = f"The index could not be kept in {self.folder}: {error.strerror or error}."
+            why = error.strerror or error
+            self.trouble = f"The index could not be kept in {self.folder}: {why} ({ENVIRONMENT}=off leaves it out)."
 
 
 def _read(file: Path) -> State:

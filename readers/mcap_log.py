@@ -99,8 +99,7 @@ class McapLog(IndexedLog):
             self._blocks.clear()
             Scan(self, segment, fault).run()
             blocks = [block for block in self._blocks if isinstance(block, McapBlock)]
-            if self.cached is not None:
-                self.keep(mcap_state(self, blocks), time.perf_counter() - begun)
+            self.keep(lambda: mcap_state(self, blocks), time.perf_counter() - begun)
         if segment.profile:
             self.format = f"MCAP, profile {segment.profile}"
 

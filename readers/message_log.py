@@ -159,10 +159,10 @@ class MessageLog(abc.ABC):
             return False
         return True
 
-    def keep(self, state: State | None, taken_s: float) -> None:
-        """Keep what it took some time to find."""
-        if self.cached is not None and state is not None:
-            self.cached.save(state, taken_s)
+    def keep(self, state: Callable[[], State | None], taken_s: float) -> None:
+        """Keep what took `taken_s` seconds to find, if that was long; `state` gives it, None if it cannot be kept."""
+        if self.cached is not None and self.cached.worth(taken_s) and (found := state()) is not None:
+            self.cached.save(found)
 
     def lose(self, loss: Loss) -> None:
         """Note a loss, once."""

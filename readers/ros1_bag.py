@@ -345,9 +345,8 @@ class Ros1Log(MessageLog):
         if not self.recall(self._put):
             begun = time.perf_counter()
             self._open()
-            if self.cached is not None:
-                found = Ros1Found(self._by_id, self._chunks, self._told)
-                self.keep(ros1_state(self, found), time.perf_counter() - begun)
+            found = Ros1Found(self._by_id, self._chunks, self._told)
+            self.keep(lambda: ros1_state(self, found), time.perf_counter() - begun)
 
     def _put(self, state: State) -> None:
         self._by_id, self._chunks, self._told = put_ros1(self, state, self._size)

@@ -132,7 +132,7 @@ class SqliteLog(MessageLog):
         if not self.recall(lambda state: found.extend(db3_counted(state))):
             begun = time.perf_counter()
             found = list(self._database.execute(self._COUNT))
-            self.keep(db3_state(found), time.perf_counter() - begun)
+            self.keep(lambda: db3_state(found), time.perf_counter() - begun)
         return found
 
     def _judge_strangers(self, count: int) -> None:
