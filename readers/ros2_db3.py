@@ -13,6 +13,7 @@ import mmap
 import re
 import shutil
 import sqlite3
+import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from functools import partial
@@ -21,6 +22,8 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
+from readers.index_cache import Entry
+from readers.index_states import Counted, db3_counted, db3_state
 from readers.message_log import Channel, Message, MessageLog, Source, escaped
 from readers.salvage import Cause, Loss, Tally
 from readers.sqlite_pages import BrokenRowError, Pages, Row
@@ -48,8 +51,8 @@ class SqliteLog(MessageLog):
         RecordingError: no database of a ROS 2 bag, or one of which nothing can be read.
     """
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, "ROS 2 bag, sqlite3")
+    def __init__(self, path: Path, cached: Entry | None = None) -> None:
+        super().__init__(path, "ROS 2 bag, sqlite3", cached)
         self._by_id: dict[int, Channel] = {}
         self._copy: TemporaryDirectory[str] | None = None
         self._readable = path
@@ -106,8 +109,7 @@ class SqliteLog(MessageLog):
             return
         try:
             self._read_tables()
-            counted = list(self._database.execute(self._COUNT))
-            fault = self._index_fault(sum(row[3] for row in counted), sum(row[-1] or 0 for row in counted))
+            counted, fault = self._counts()
         except (sqlite3.DatabaseError, UnicodeDecodeError, TypeError) as error:
             self._read_pages(str(error), listed=False)
             return
@@ -148,6 +150,24 @@ class SqliteLog(MessageLog):
                 self._table = "messages NOT INDEXED"
                 self._harm(Cause.ORDER, "the index of times differs from the messages, which are read without it")
         return ""
+
+    def _counts(self) -> tuple[Counted, str]:
+        """What `_COUNT` gives, and the fault of the index of times; "" for none.
+
+        Both take a pass over all rows, so the answer is kept, but not of an index that differs from the table, nor
+        where a log lies beside.
+        """
+        found: Counted = []
+        if self._copy is not None:
+            self.cached = None
+        if self.recall(lambda state: found.extend(db3_counted(state))):
+            return found, ""
+        begun = time.perf_counter()
+        found = list(self._database.execute(self._COUNT))
+        fault = self._index_fault(sum(row[3] for row in found), sum(row[-1] or 0 for row in found))
+        if not fault and self._table == "messages":
+            self.keep(lambda: db3_state(found), time.perf_counter() - begun)
+        return found, fault
 
     def _judge_strangers(self, count: int) -> None:
         if count:
