@@ -27,45 +27,81 @@ Columns = dict[str, Iterable[FloatArray]]
 _SECOND_NS = np.int64(1_000_000_000)
 
 
+class _Rows(NamedTuple):
+    """Messages of one layout: times [N] in ns, numbers [N, n], and which of them need no care."""
+
+    kind: _Kind
+    received_ns: NDArray[np.int64]
+    header_ns: NDArray[np.int64]
+    numbers: FloatArray
+    plain: NDArray[np.bool_]
+
+
+def _rows_of(messages: Sequence[Message]) -> _Rows | None:
+    """The numbers of messages of one channel that has a fixed layout; None if they are not rows of one layout."""
+    kind = _KINDS.get(ros_name(messages[0].channel.type).replace("/msg/", "/"))
+    first = messages[0].data
+    if kind is None or (at := kind.numbers_at(first)) is None:
+        return None
+    data = [message.data for message in messages]
+    if set(map(len, data)) != {len(first)}:
+        return None
+    table = np.frombuffer(b"".join(data), _row_type(len(first), at))
+    if np.any(table["mark"] != table["mark"][0]) or np.any(table["texts"] != table["texts"][0]):
+        return None
+    try:
+        received_ns = np.array([message.log_ns for message in messages], np.int64)
+    except OverflowError:
+        return None
+    header_ns = table["seconds"] * _SECOND_NS + table["nanoseconds"]
+    numbers = np.frombuffer(table["numbers"].tobytes(), "<f8").reshape(len(data), -1)  # aligned, and read-only
+    plain = kind.plain(numbers) & (header_ns > 0) & (np.abs(header_ns - received_ns) < DAY_NS)
+    return _Rows(kind, received_ns, header_ns, numbers, plain)
+
+
 def read_rows(messages: Sequence[Message], stream: str, offset_ns: int) -> Sequence[Sample | None]:
     """The samples of messages of one channel that has a fixed layout, at their header stamps plus `offset_ns`.
 
     None for a message that is to be read by itself; nothing at all if they are not rows of one layout.
     """
-    kind = _KINDS.get(ros_name(messages[0].channel.type).replace("/msg/", "/"))
-    first = messages[0].data
-    if kind is None or (at := kind.numbers_at(first)) is None:
+    if (rows := _rows_of(messages)) is None:
         return ()
-    data = [message.data for message in messages]
-    if set(map(len, data)) != {len(first)}:
-        return ()
-    table = np.frombuffer(b"".join(data), _row_type(len(first), at))
-    if np.any(table["mark"] != table["mark"][0]) or np.any(table["texts"] != table["texts"][0]):
-        return ()
-    logged_ns = [message.log_ns for message in messages]
-    try:
-        received_ns = np.array(logged_ns, np.int64)
-    except OverflowError:
-        return ()
-    header_ns = table["seconds"] * _SECOND_NS + table["nanoseconds"]
-    numbers = np.frombuffer(table["numbers"].tobytes(), "<f8").reshape(len(data), -1)  # aligned, and read-only
-    plain = kind.plain(numbers) & (header_ns > 0) & (np.abs(header_ns - received_ns) < DAY_NS)
-    stamps = header_ns.tolist()
+    stamps = rows.header_ns.tolist()
     samples: list[Any] = _made(
-        kind.sample,
-        len(data),
+        rows.kind.sample,
+        len(messages),
         stream=repeat(stream),
-        t_ns=stamps if not offset_ns else (header_ns + offset_ns).tolist(),
-        received_ns=logged_ns,
+        t_ns=stamps if not offset_ns else (rows.header_ns + offset_ns).tolist(),
+        received_ns=[message.log_ns for message in messages],
         oddities=repeat(()),
         header_ns=stamps,
         published_ns=[message.publish_ns for message in messages],
-        **kind.columns(numbers),
+        **rows.kind.columns(rows.numbers),
     )
-    if not plain.all():
-        for place in np.flatnonzero(~plain):
+    if not rows.plain.all():
+        for place in np.flatnonzero(~rows.plain):
             samples[place] = None
     return samples
+
+
+def fill_rows(messages: Sequence[Message], offset_ns: int, out: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Write what `read_rows` makes of the messages into rows of `readers.sample_arrays`.
+
+    Returns:
+        Which rows of `out` were written; the messages of the others are to be read by themselves.
+    """
+    none = np.zeros(len(messages), bool)
+    if (rows := _rows_of(messages)) is None:
+        return none
+    try:
+        out["published_ns"] = [message.publish_ns for message in messages]
+    except OverflowError:
+        return none
+    out["t_ns"], out["header_ns"], out["received_ns"] = rows.header_ns + offset_ns, rows.header_ns, rows.received_ns
+    for name, values in rows.kind.columns(rows.numbers).items():
+        out[name] = values
+    out["readable"] = True
+    return rows.plain
 
 
 @lru_cache(maxsize=64)

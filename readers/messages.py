@@ -19,6 +19,7 @@ import numpy as np
 from readers.clock import sane_stamp
 from readers.decoding import MessageError
 from readers.images import RAW_FORMATS, image_header, is_depth
+from readers.message_log import escaped
 from readers.streams import (
     UNKNOWN_COV3,
     UNKNOWN_COV6,
@@ -142,8 +143,9 @@ def frame_of(message: Any) -> str:
 
 
 def plain_frame(name: Any) -> str:
-    """A frame's name without the leading slash of old tf."""
-    return str(name).lstrip("/")
+    """A frame's name without the leading slash of old tf, `escaped`."""
+    frame = str(name).lstrip("/")
+    return frame if frame.isprintable() else escaped(frame)
 
 
 # ------------------------------------------------------------------------------ small parts

@@ -174,7 +174,7 @@ class SensorWriter(_Writer):
         """Log that a frame has no image, and why; the viewer then shows none."""
         self._write()
         at = np.array([frame]), np.array([t_ns])
-        self._file.send("/camera/problems", *at, rr.TextLog.columns(text=[reason], level=["ERROR"]))
+        self._file.send("/camera/problems", *at, texts([traces.Event(frame, Severity.ERROR, reason)]))
         self._file.send(IMAGE, *at, rr.Clear.columns(is_recursive=[False]))
 
     def reference(self, poses: Sequence[PoseSample]) -> None:

@@ -7,8 +7,8 @@ import re
 from collections.abc import Iterable, Mapping, Sequence
 
 from workbench.report.facts import Facts, commands, harm_text, length, spans_text
-from workbench.report.markup import printable
 from workbench.report.page import WORDS, metric_rows
+from workbench.safe_text import printable
 
 FINDINGS = 10
 """Findings that are told in full."""
