@@ -59,6 +59,8 @@ class CameraSettings(BaseModel):
         centre = self.centre_px or ((width_px - 1) / 2, (height_px - 1) / 2)
         matrix = np.array([[self.focal_px, 0, centre[0]], [0, self.focal_y_px or self.focal_px, centre[1]], [0, 0, 1]])
         return Camera(
+            rectification=np.full((3, 3), np.nan),
+            projection=np.full((3, 4), np.nan),
             width_px=width_px,
             height_px=height_px,
             matrix=matrix,
