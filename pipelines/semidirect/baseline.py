@@ -157,8 +157,11 @@ class BaselineOdometry:
     def __init__(self, settings: BaselineSettings) -> None:
         s = self._settings = settings
         alignment = FeatureOptions(s.align_iterations)
-        self._coarse = SearchOptions(s.coarse_px, s.max_score, s.finest_level, s.coarsest_level, alignment)
-        self._fine = self._coarse._replace(radius_px=s.fine_px)
+        self._coarse = SearchOptions(
+            s.coarse_px, s.max_score, s.max_score_share, s.finest_level, s.coarsest_level, s.finest_level, alignment
+        )
+        self._fine = self._coarse._replace(radius_px=s.fine_px, align_level=s.align_level)
+        self._again = self._coarse._replace(radius_px=s.fine_px)
         limits = epipolar.Limits(worst_score=s.max_score, top_level=s.coarsest_level, iterations=s.align_iterations)
         self._growth = Growth(s.corner_cell_px, s.corner_min_score, s.depth_sigmas, s.min_depth_range, limits)
 
@@ -462,7 +465,7 @@ class BaselineOdometry:
             m = baseline_map.without(m, keyframe=int(m.nearest(centre)[-1]))
         m = baseline_map.with_new_points(m, optics, self._growth)
         made = np.flatnonzero(m.ids >= before[0])
-        m = baseline_map.found_again(m, optics, made, m.nearest(centre)[1 : 1 + NEIGHBOURS], self._fine)
+        m = baseline_map.found_again(m, optics, made, m.nearest(centre)[1 : 1 + NEIGHBOURS], self._again)
 
         options = BundleOptions(s.local_iterations, s.bundle_huber_px, inlier_px=s.inlier_px)
         local = baseline_map.local_bundle(m, optics, s.local_keyframes, options)

@@ -34,17 +34,13 @@ from pipelines.semidirect.step import Feature
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
 
-RING = np.array(
-    [
-        (0, -3), (1, -3), (2, -2), (3, -1), (3, 0), (3, 1), (2, 2), (1, 3),
-        (0, 3), (-1, 3), (-2, 2), (-3, 1), (-3, 0), (-3, -1), (-2, -2), (-1, -3),
-    ]
-)  # fmt: skip
-ARC = 9
-"""So many neighbours in a row on the ring, all brighter or all darker, make a corner."""
 SMALLEST_AREA, LARGEST_AREA = 0.25, 3.0
 """A patch whose pixels cover less or more of those of the level searched is not compared."""
+SMALL_WIDTH_PX = 40
+"""The small image is that of the coarsest level at least so wide."""
 SMALL_SIGMA_PX = 1.5
+BLANK_RMS = 0.5
+"""Grey levels below which a small image shows nothing."""
 PATCH_CENTRE = 0.5
 """A patch's corner lies so far beyond the middle of its pixels, which the alignment takes for its place."""
 
@@ -55,7 +51,7 @@ _NO_REFERENCE, _NOT_CONVERGED = int(Feature.REFERENCE_OUT_OF_VIEW), int(Feature.
 class CornerTable(NamedTuple):
     """FAST corners by level and row: those of row y of level l are `column`[first[l, y] : first[l, y + 1]].
 
-    `column` [n]; `first` [LEVELS, height + 1], empty rows on levels that were not looked at.
+    `column` [n]; `first` [LEVELS, height + 1], no corners on levels that were not looked at.
     """
 
     column: Longs
@@ -77,62 +73,28 @@ def view_of(image: Grey, finest: int, coarsest: int, threshold: int) -> View:
         ValueError: see `pyramid_of`.
     """
     pyramid = pyramid_of(image)
-    small = cv2.GaussianBlur(level_image(pyramid, LEVELS - 1).astype(np.float32), (0, 0), SMALL_SIGMA_PX)
-    return View(pyramid, corner_table(pyramid, finest, coarsest, threshold), np.asarray(small - small.mean()))
+    blurred = cv2.GaussianBlur(level_image(pyramid, small_level(pyramid)).astype(np.float32), (0, 0), SMALL_SIGMA_PX)
+    return View(pyramid, corner_table(pyramid, finest, coarsest, threshold), np.asarray(blurred - blurred.mean()))
+
+
+def small_level(pyramid: Pyramid) -> int:
+    """The level of the small image."""
+    return max((level for level in range(LEVELS) if pyramid.width >> level >= SMALL_WIDTH_PX), default=0)
 
 
 # ------------------------------------------------------------------------------------- corners
 
 
-@compiled
 def corner_table(pyramid: Pyramid, finest: int, coarsest: int, threshold: int) -> CornerTable:
-    """The FAST corners of the levels from finest to coarsest."""
-    columns, first = (
-        np.empty(pyramid.height * pyramid.width, np.int64),
-        np.zeros((LEVELS, pyramid.height + 1), np.int64),
-    )
-    count = 0
-    for level in range(LEVELS):
-        first[level, :] = count
-        if not finest <= level <= coarsest:
-            continue
-        image = level_image(pyramid, level)
-        steps = np.empty(16, np.int64)
-        for k in range(16):
-            steps[k] = RING[k, 1] * image.shape[1] + RING[k, 0]
-        flat = image.reshape(-1)
-        for y in range(3, image.shape[0] - 3):
-            first[level, y] = count
-            for x in range(3, image.shape[1] - 3):
-                if is_corner(flat, y * image.shape[1] + x, steps, threshold):
-                    columns[count] = x
-                    count += 1
-            first[level, y + 1 :] = count
-    return CornerTable(columns[:count].copy(), first)
-
-
-@compiled
-def is_corner(flat: Grey, place: int, steps: Longs, threshold: int) -> bool:
-    """Whether `ARC` neighbours in a row differ from the pixel by more than the threshold, with one sign.
-
-    Of any such nine at least two are among the four at right angles, which most pixels fail at once.
-    """
-    high, low = int(flat[place]) + threshold, int(flat[place]) - threshold
-    bright, dark = 0, 0
-    for k in range(0, 16, 4):
-        grey = int(flat[place + steps[k]])
-        bright += grey > high
-        dark += grey < low
-    if bright < 2 and dark < 2:
-        return False
-    brighter, darker = 0, 0
-    for k in range(16 + ARC - 1):
-        grey = int(flat[place + steps[k & 15]])
-        brighter = brighter + 1 if grey > high else 0
-        darker = darker + 1 if grey < low else 0
-        if brighter == ARC or darker == ARC:
-            return True
-    return False
+    """The FAST corners of the levels from finest to coarsest; the strongest of neighbours are not singled out."""
+    detector = cv2.FastFeatureDetector.create(threshold, nonmaxSuppression=False)
+    columns, first = [np.zeros(0, np.int64)], np.zeros((LEVELS, pyramid.height + 1), np.int64)
+    for level in range(finest, coarsest + 1):
+        places = cv2.KeyPoint.convert(detector.detect(level_image(pyramid, level)))
+        column, row = np.asarray(places, np.int64).reshape(-1, 2).T
+        first[level] = sum(map(len, columns)) + np.searchsorted(row, np.arange(pyramid.height + 1))
+        columns.append(column)  # OpenCV gives them row by row
+    return CornerTable(np.concatenate(columns), first)
 
 
 def free_corners(view: View, taken_px: Floats, taken_level: Longs, cell_px: int, min_score: float) -> Corners:
@@ -166,12 +128,18 @@ class Sources(NamedTuple):
 
 
 class SearchOptions(NamedTuple):
-    """Search radius (px of level 0), worst score (grey levels²), levels with corners, the alignment's iterations."""
+    """Settings of `find_points`.
+
+    Search radius, px of level 0; worst score, grey levels², and as a share of the patch's variance; levels with
+    corners; the first level whose matches are aligned to a part of a pixel, and how.
+    """
 
     radius_px: float
     max_score: float
+    max_share: float
     finest: int
     coarsest: int
+    align_level: int
     alignment: FeatureOptions
 
 
@@ -266,16 +234,22 @@ def find_points(
         image = level_image(pyramid, level)
         u, v = on_level(m.predicted[i, 0], level), on_level(m.predicted[i, 1], level)
         m.score[i], column, row = best_corner(image, view.corners, level, patch, u, v, options.radius_px / (1 << level))
-        if not m.score[i] < options.max_score:
+        if not m.score[i] < min(options.max_score, options.max_share * variance(patch)):
             m.outcome[i] = _NOT_CONVERGED
             continue
-        place = align_patch(image, patch, column - PATCH_CENTRE, row - PATCH_CENTRE, options.alignment)
-        m.outcome[i] = place.outcome  # the numbers of features.Outcome are those of Feature
-        m.found[i, 0], m.found[i, 1] = (
-            on_finest(place.u + PATCH_CENTRE, level),
-            on_finest(place.v + PATCH_CENTRE, level),
-        )
+        found_u, found_v = float(column), float(row)
+        if level >= options.align_level:
+            place = align_patch(image, patch, column - PATCH_CENTRE, row - PATCH_CENTRE, options.alignment)
+            m.outcome[i] = place.outcome  # the numbers of features.Outcome are those of Feature
+            found_u, found_v = place.u + PATCH_CENTRE, place.v + PATCH_CENTRE
+        m.found[i, 0], m.found[i, 1] = on_finest(found_u, level), on_finest(found_v, level)
     return m
+
+
+@compiled
+def variance(patch: Floats) -> float:
+    """Variance of the inner 8 x 8 of a patch [10, 10], grey levels²: the score of a corner without any texture."""
+    return float(np.var(patch[1:-1, 1:-1]))
 
 
 @compiled
@@ -304,8 +278,10 @@ def best_corner(
 
 def correlation(a: NDArray[np.float32], b: NDArray[np.float32]) -> float:
     """The normalised correlation of two small images of mean 0; 0 where one is blank."""
-    size = float(np.linalg.norm(a)) * float(np.linalg.norm(b))
-    return float(np.vdot(a, b)) / size if size > 0 else 0.0
+    sizes = float(np.linalg.norm(a)), float(np.linalg.norm(b))
+    if min(sizes) < BLANK_RMS * math.sqrt(a.size):
+        return 0.0
+    return float(np.vdot(a, b)) / (sizes[0] * sizes[1])
 
 
 def turn_between(optics: Optics, before: View, after: View) -> Floats | None:
@@ -323,7 +299,7 @@ def turn_between(optics: Optics, before: View, after: View) -> Floats | None:
     rows, columns = before.small.shape
     grid = np.stack(np.meshgrid(np.linspace(0, columns - 1, 5), np.linspace(0, rows - 1, 5)), axis=-1).reshape(-1, 2)
     there = grid @ warp[:, :2].T + warp[:, 2]
-    size = 1 << (LEVELS - 1)
+    size = 1 << small_level(before.pyramid)
     seen = [rays(optics, (pixels + 0.5) * size - 0.5) for pixels in (grid, there)]
     known = np.all(np.isfinite(seen[0]) & np.isfinite(seen[1]), axis=1)
     if np.count_nonzero(known) < 3:

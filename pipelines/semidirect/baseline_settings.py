@@ -43,7 +43,11 @@ class BaselineSettings(CameraSettings):
     fine_points: Count = Field(1000, description="most points of the fine step")
     fine_px: Positive = Field(5.0, description="its search radius, twice that without a coarse step")
     max_score: Positive = Field(1500.0, description="worst mean squared difference of a match, grey levels²")
-    align_iterations: Count = Field(10, description="most iterations of a match's alignment")
+    max_score_share: Positive = Field(0.5, description="the same as a share of the patch's variance")
+    align_level: Level = Field(
+        3, description="matches of the fine step on this level and coarser are aligned to a part of a pixel"
+    )
+    align_iterations: Count = Field(10, description="most iterations of an alignment")
     pose_iterations: Count = Field(10, description="most iterations of the pose")
     inlier_px: Positive = Field(2.0, description="a larger reprojection error is an outlier, px of the level")
 
