@@ -117,8 +117,8 @@ class BaselineState:
     """All that the baseline carries from frame to frame.
 
     `view`, `frame` and `t_ns` are those of the last frame that could be used; `trail` there is while a map is being
-    started. `pose` is the last cam_T_world [4, 4] that was found, at `pose_ns`, and `velocity` [6] the twist per second
-    of the motion to it.
+    started. `pose` is the last cam_T_world [4, 4] that was found, at `pose_ns`; `guess` goes on from there while lost,
+    with the `velocity` [6], a twist per second.
     `since_bundle` counts the keyframes since the last global bundle.
     """
 
@@ -134,6 +134,7 @@ class BaselineState:
     unit: Unit = Unit(False, math.nan, math.nan)
     pose: Floats | None = None
     pose_ns: int = -1
+    guess: Floats | None = None
     velocity: Floats | None = None
     lost_frames: int = 0
     relocalised_frames: int = -1
@@ -346,6 +347,7 @@ class BaselineOdometry:
             map_number=now.map_number + 1,
             unit=unit,
             pose=pose,
+            guess=pose,
             pose_ns=now.t_ns,
             velocity=velocity,
             lost_frames=0,
@@ -357,9 +359,9 @@ class BaselineOdometry:
     def _tracking(self, now: BaselineState, notes: Notes) -> tuple[BaselineState, Tracked | None, Stage, Verdict]:
         """The pose by the motion model and the map; where that fails, by the keyframe that looks alike."""
         s, m, pose = self._settings, _known(now.map), _known(now.pose)
-        seconds = (now.t_ns - now.pose_ns) * 1e-9
-        motion = _known(now.velocity) * s.velocity_decay**now.lost_frames * seconds
-        tracked = self._track(now, se3_product(se3_exp(motion), pose))
+        motion = se3_exp(_known(now.velocity) * now.intervals[-1])
+        now = replace(now, guess=se3_product(motion, _known(now.guess)))
+        tracked = self._track(now, _known(now.guess))
         stage, alarms = Stage.TRACKED, Verdict.OK
         if not self._holds(tracked, s.good_share if now.lost_frames else s.lost_share):
             found = self._relocalised(now, notes)
@@ -368,13 +370,14 @@ class BaselineOdometry:
                 return self._lost(now), None, Stage.LOST, Verdict.LOST
             tracked, stage, alarms = found, Stage.RELOCALISED, Verdict.REACQUIRED
         refined = _known(tracked.pose)
-        velocity = se3_log(se3_product(refined.cam_t_world, se3_inverse(pose))) / seconds
+        moved = se3_log(se3_product(refined.cam_t_world, se3_inverse(pose)))
         now = replace(
             now,
             map=_counted(m, tracked),
             pose=refined.cam_t_world,
             pose_ns=now.t_ns,
-            velocity=np.zeros(6) if stage is Stage.RELOCALISED else velocity,
+            guess=refined.cam_t_world,
+            velocity=np.zeros(6) if stage is Stage.RELOCALISED else moved / ((now.t_ns - now.pose_ns) * 1e-9),
             lost_frames=0,
             relocalised_frames=0 if stage is Stage.RELOCALISED else now.relocalised_frames,
         )
@@ -424,8 +427,14 @@ class BaselineOdometry:
         """The state after a frame without a pose; a new map is begun when that has lasted."""
         s = self._settings
         forgotten = s.restart_s > 0 and (now.t_ns - now.pose_ns) * 1e-9 > s.restart_s
-        m = _known(now.map)
-        return replace(now, lost_frames=now.lost_frames + 1, map=None if forgotten else m, points_made=m.made)
+        m, velocity = _known(now.map), _known(now.velocity) * s.velocity_decay
+        return replace(
+            now,
+            velocity=velocity,
+            lost_frames=now.lost_frames + 1,
+            map=None if forgotten else m,
+            points_made=m.made,
+        )
 
     def _relocalised(self, now: BaselineState, notes: Notes) -> Tracked | None:
         """Tracking from the keyframe whose small image is most like this one's, turned as it lies best over it."""
@@ -481,7 +490,7 @@ class BaselineOdometry:
             **_bundle_notes(adjusted),
             **_structure(m, optics, _known(tracked.pose).scale_px),
         }
-        return replace(now, map=m, pose=m.poses[-1], since_bundle=since)
+        return replace(now, map=m, pose=m.poses[-1], guess=m.poses[-1], since_bundle=since)
 
     # -------------------------------------------------------------------------------- record
 
