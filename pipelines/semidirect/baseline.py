@@ -75,6 +75,10 @@ class Trail(NamedTuple):
     now_px: Floats
     level: Longs
 
+    def chosen(self, which: Flags) -> Trail:
+        """Some of the corners."""
+        return self._replace(first_px=self.first_px[which], now_px=self.now_px[which], level=self.level[which])
+
 
 class Unit(NamedTuple):
     """The scale: whether lengths are metres, metres of a unit of the first map and their standard deviation."""
@@ -195,7 +199,7 @@ class BaselineOdometry:
 
     def packed(self, state: BaselineState) -> BaselineState:
         """The state with the images of its frames by number, see `Resumable`."""
-        return _with_views(state, lambda frame, _: FrameImage(frame), None)
+        return _with_views(state, FrameImage)
 
     def unpacked(self, packed: Any, images: Images) -> BaselineState:
         """The state that was packed, see `Resumable`.
@@ -205,7 +209,7 @@ class BaselineOdometry:
         """
         if not isinstance(packed, BaselineState):
             raise EstimatorError(f"{type(packed).__name__} is no state of the estimator {self.name!r}; replay again")
-        whole = _with_views(packed, lambda frame, _: self._view(eight_bit(images(frame))), None)
+        whole = _with_views(packed, lambda frame: self._view(eight_bit(images(frame))))
         if whole.map is None:
             return whole
         buffers = np.array([view.pyramid.buffer for view in whole.map.views])
@@ -237,7 +241,7 @@ class BaselineOdometry:
             t_ns=sample.t_ns,
             view=view,
             optics=state.optics or self._optics(view),
-            intervals=(*state.intervals[-INTERVALS + 1 :], *([dt_s] if dt_s == dt_s else [])),
+            intervals=() if state.view is None else (*state.intervals[1 - INTERVALS :], dt_s),
             relocalised_frames=state.relocalised_frames + (state.relocalised_frames >= 0),
         )
         notes: Notes = {"corners": len(view.corners.column)}
@@ -292,9 +296,10 @@ class BaselineOdometry:
         limits = StartLimits(
             s.start_min_matches, s.start_motion_px, s.start_parallax_px, s.inlier_px, s.start_min_inliers
         )
-        solved = start(
-            rays(optics, trail.first_px)[:, :2], rays(optics, trail.now_px)[:, :2], optics.focal_u, limits=limits
-        )
+        first, second = rays(optics, trail.first_px)[:, :2], rays(optics, trail.now_px)[:, :2]
+        known = np.all(np.isfinite(first) & np.isfinite(second), axis=1)
+        trail = trail.chosen(known)
+        solved = start(first[known], second[known], optics.focal_u, limits=limits)
         notes |= {
             "start_matches": len(trail.now_px),
             "start_motion_px": solved.motion_px,
@@ -314,7 +319,8 @@ class BaselineOdometry:
         plane = scale.plane_of(solved.points[solved.inlier])
         planar, height, unit = s.start_pose, plane.distance, Unit(False, math.nan, math.nan)
         if now.pose is not None:
-            planar, height = _planar(s, now.pose), float(se3_inverse(now.pose)[2, 3])
+            planar, last = _planar(s, now.pose), float(se3_inverse(now.pose)[2, 3])
+            height = last if last > 0 else height
         elif s.height_m is not None:
             height = s.height_m
             one = (np.array([x]) for x in (height, s.height_sigma_m, plane.distance, plane.sigma))
@@ -366,7 +372,7 @@ class BaselineOdometry:
         if not self._holds(tracked, s.good_share if now.lost_frames else s.lost_share):
             found = self._relocalised(now, notes)
             if found is None:
-                notes |= _track_notes(m, tracked)
+                notes |= _track_notes(m, tracked) | {"pose_sigma": np.full(6, math.nan)}
                 return self._lost(now), None, Stage.LOST, Verdict.LOST
             tracked, stage, alarms = found, Stage.RELOCALISED, Verdict.REACQUIRED
         refined = _known(tracked.pose)
@@ -391,32 +397,33 @@ class BaselineOdometry:
         high = seen[m.sources(seen).level >= s.coarse_level]
         rows = _spread(high, s.coarse_points)
         match = self._search(now, prior, rows, self._coarse)
-        matched = match.outcome == Feature.MATCHED
-        coarse, tried, found, fine = prior, len(rows), int(np.count_nonzero(matched)), self._fine
+        coarse, tried, found, fine = prior, len(rows), match.found_count, self._fine
         if found >= s.coarse_min:
-            options = PoseOptions(s.pose_iterations, s.pose_iterations, inlier_px=s.inlier_px)
-            coarse = refine_pose(
-                optics, m.points[rows[matched]], match.found[matched], match.level[matched], prior, options
-            ).cam_t_world
+            coarse = self._refined(now, prior, rows, match, s.pose_iterations).cam_t_world
             seen = baseline_map.visible(m, optics, coarse, view)
         else:
             fine = fine._replace(radius_px=2 * fine.radius_px)
         rows = _spread(seen, s.fine_points)
         match = self._search(now, coarse, rows, fine)
-        matched = match.outcome == Feature.MATCHED
-        error, inlier = np.full(len(rows), np.nan), np.zeros(len(rows), np.bool_)
-        if np.count_nonzero(matched) < s.min_tracked:
-            return Tracked(prior, coarse, tried, found, rows, match, None, error, inlier)
-        options = PoseOptions(s.pose_iterations, s.pose_iterations // 2, inlier_px=s.inlier_px)
-        pose = refine_pose(optics, m.points[rows[matched]], match.found[matched], match.level[matched], coarse, options)
-        error[matched], inlier[matched] = pose.error_px, pose.inlier
-        return Tracked(prior, coarse, tried, found, rows, match, pose if pose.solved else None, error, inlier)
+        pose, error, inlier = None, np.full(len(rows), np.nan), np.zeros(len(rows), np.bool_)
+        if match.found_count >= s.min_tracked:
+            refined = self._refined(now, coarse, rows, match, s.pose_iterations // 2)
+            error[match.matched], inlier[match.matched] = refined.error_px, refined.inlier
+            pose = refined if refined.solved else None
+        return Tracked(prior, coarse, tried, found, rows, match, pose, error, inlier)
 
     def _search(self, now: BaselineState, pose: Floats, rows: Longs, options: SearchOptions) -> Matches:
         m = _known(now.map)
         return find_points(
             _known(now.optics), m.buffers, m.poses, _known(now.view), pose, m.points[rows], m.sources(rows), options
         )
+
+    def _refined(self, now: BaselineState, guess: Floats, rows: Longs, match: Matches, by_errors: int) -> RefinedPose:
+        """The pose of the points that were matched, with so many iterations whose scale follows from the errors."""
+        s, which = self._settings, match.matched
+        options = PoseOptions(s.pose_iterations, by_errors, inlier_px=s.inlier_px)
+        points = _known(now.map).points[rows[which]]
+        return refine_pose(_known(now.optics), points, match.found[which], match.level[which], guess, options)
 
     def _holds(self, tracked: Tracked, least_share: float) -> bool:
         """Whether enough points agree with the pose."""
@@ -456,37 +463,41 @@ class BaselineOdometry:
 
     def _mapping(self, now: BaselineState, tracked: Tracked, notes: Notes) -> BaselineState:
         """Decide on a keyframe; with one, the map grows and is adjusted."""
-        s, m, optics, pose = self._settings, _known(now.map), _known(now.optics), _known(now.pose)
-        used = tracked.rows[tracked.inlier]
-        depth = float(np.median(_depths(pose, m.points[used])))
-        centre = se3_inverse(pose)[:3, 3]
-        distance = float(np.min(np.linalg.norm(m.centres - centre, axis=1))) / depth
+        s, m, pose = self._settings, _known(now.map), _known(now.pose)
+        depth = float(np.median(_depths(pose, m.points[tracked.rows[tracked.inlier]])))
+        distance = float(np.min(np.linalg.norm(m.centres - se3_inverse(pose)[:3, 3], axis=1))) / depth
         notes |= {"scene_depth_m": depth, "keyframe_distance": distance}
         if distance <= s.keyframe_distance or tracked.share < s.good_share:
             return now
-        before = m.made, len(m.points)
+        return self._with_keyframe(now, tracked, notes)
+
+    def _with_keyframe(self, now: BaselineState, tracked: Tracked, notes: Notes) -> BaselineState:
+        """The state with a keyframe more, new points, and the map adjusted."""
+        s, m, optics, pose = self._settings, _known(now.map), _known(now.optics), _known(now.pose)
+        made, count, used, match = m.made, len(m.points), tracked.inlier, tracked.match
+        newest, centre = np.full(tracked.agreeing, len(m.frames)), se3_inverse(pose)[:3, 3]
         m = baseline_map.with_keyframe(m, now.frame, _known(now.view), pose)
-        newest = np.full(len(used), len(m.frames) - 1)
-        match = tracked.match
-        m = baseline_map.with_seen(m, Seen(used, newest, match.found[tracked.inlier], match.level[tracked.inlier]))
+        m = baseline_map.with_seen(m, Seen(tracked.rows[used], newest, match.found[used], match.level[used]))
         m = baseline_map.without(m, points=(m.outliers > s.point_outliers) & (m.outliers > m.inliers))
         if len(m.frames) > s.max_keyframes:
             m = baseline_map.without(m, keyframe=int(m.nearest(centre)[-1]))
         m = baseline_map.with_new_points(m, optics, self._growth)
-        made = np.flatnonzero(m.ids >= before[0])
-        m = baseline_map.found_again(m, optics, made, m.nearest(centre)[1 : 1 + NEIGHBOURS], self._again)
+        new = np.flatnonzero(m.ids >= made)
+        m = baseline_map.found_again(m, optics, new, m.nearest(centre)[1 : 1 + NEIGHBOURS], self._again)
 
-        options = BundleOptions(s.local_iterations, s.bundle_huber_px, inlier_px=s.inlier_px)
-        local = baseline_map.local_bundle(m, optics, s.local_keyframes, options)
-        adjusted, since = [local], now.since_bundle + 1
+        options, since = (
+            BundleOptions(s.local_iterations, s.bundle_huber_px, inlier_px=s.inlier_px),
+            now.since_bundle + 1,
+        )
+        adjusted = [baseline_map.local_bundle(m, optics, s.local_keyframes, options)]
         if s.global_every and since >= s.global_every:
-            options = options._replace(iterations=s.global_iterations)
-            adjusted, since = [local, baseline_map.global_bundle(local.map, optics, options)], 0
+            options, since = options._replace(iterations=s.global_iterations), 0
+            adjusted.append(baseline_map.global_bundle(adjusted[0].map, optics, options))
         m = adjusted[-1].map
         notes |= {
             "keyframe": 1,
-            "points_added": m.made - before[0],
-            "points_removed": before[1] + m.made - before[0] - len(m.points),
+            "points_added": m.made - made,
+            "points_removed": count + m.made - made - len(m.points),
             **_bundle_notes(adjusted),
             **_structure(m, optics, _known(tracked.pose).scale_px),
         }
@@ -559,10 +570,7 @@ def followed(trail: Trail, view: View) -> Trail:
     )
     height, width = image.shape
     inside = np.all((there >= 0) & (there <= np.array([width - 1, height - 1])), axis=1)
-    stays = (good.ravel() == 1) & inside
-    return trail._replace(
-        first_px=trail.first_px[stays], now_px=there[stays].astype(np.float64), level=trail.level[stays]
-    )
+    return trail._replace(now_px=there.astype(np.float64)).chosen((good.ravel() == 1) & inside)
 
 
 def levelled(up_in_cam: Floats, heading_rad: float, position_m: Floats) -> Floats:
@@ -610,15 +618,15 @@ def _laps(wanted: bool) -> Callable[[], float]:
     return lap
 
 
-def _with_views(state: BaselineState, change: Callable[[int, Any], Any], buffers: Any) -> BaselineState:
-    """The state with its views changed, which are told their frames."""
+def _with_views(state: BaselineState, made: Callable[[int], Any]) -> BaselineState:
+    """The state with views that are made of the numbers of their frames, and without the keyframes' buffers."""
     m, trail = state.map, state.trail
     if m is not None:
-        views = tuple(change(int(frame), view) for frame, view in zip(m.frames, m.views, strict=True))
-        m = replace(m, views=views, buffers=buffers)
+        none: Any = None
+        m = replace(m, views=tuple(made(frame) for frame in m.frames.tolist()), buffers=none)
     if trail is not None:
-        trail = trail._replace(view=change(trail.frame, trail.view))
-    return replace(state, map=m, trail=trail, view=None if state.view is None else change(state.frame, state.view))
+        trail = trail._replace(view=made(trail.frame))
+    return replace(state, map=m, trail=trail, view=None if state.view is None else made(state.frame))
 
 
 def _spread(rows: Longs, most: int) -> Longs:
@@ -634,9 +642,8 @@ def _depths(pose: Floats, points: Floats) -> Floats:
 def _counted(m: Map, tracked: Tracked) -> Map:
     """The map with each point's count of frames in which it agreed or did not."""
     inliers, outliers = m.inliers.copy(), m.outliers.copy()
-    matched = tracked.match.outcome == Feature.MATCHED
     inliers[tracked.rows[tracked.inlier]] += 1
-    outliers[tracked.rows[matched & ~tracked.inlier]] += 1
+    outliers[tracked.rows[tracked.match.matched & ~tracked.inlier]] += 1
     return replace(m, inliers=inliers, outliers=outliers)
 
 
@@ -710,7 +717,7 @@ def _nothing() -> Notes:
 
 def _track_notes(m: Map, tracked: Tracked) -> Notes:
     match, pose = tracked.match, tracked.pose
-    outlier = (match.outcome == Feature.MATCHED) & ~tracked.inlier
+    outlier = match.matched & ~tracked.inlier
     return {
         "tracked": tracked.agreeing,
         "pose_sigma": np.full(6, math.nan) if pose is None else np.sqrt(np.diag(pose.covariance)),

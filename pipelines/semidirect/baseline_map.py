@@ -21,7 +21,6 @@ from pipelines.semidirect.baseline_search import SearchOptions, Sources, View, f
 from pipelines.semidirect.optics import Optics, rays
 from pipelines.semidirect.pyramid import Grey
 from pipelines.semidirect.refinement import Bundle, BundleOptions, Observations, adjust, oldest_fixed, refine_points
-from pipelines.semidirect.step import Feature
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -174,6 +173,8 @@ def with_new_points(m: Map, optics: Optics, growth: Growth) -> Map:
     """
     new = len(m.frames) - 1
     pose, view, mine = m.poses[new], m.views[new], m.seen.keyframe == new
+    if not np.any(mine):
+        return m
     other = int(m.nearest(se3_inverse(pose)[:3, 3])[1])
     corners = free_corners(view, m.seen.pixels[mine], m.seen.level[mine], growth.cell_px, growth.min_score)
     bearings = rays(optics, corners.pixels)
@@ -221,9 +222,8 @@ def found_again(m: Map, optics: Optics, rows: Longs, keyframes: Longs, options: 
         match = find_points(
             optics, m.buffers, m.poses, m.views[k], m.poses[k], m.points[asked], m.sources(asked), options
         )
-        got = match.outcome == Feature.MATCHED
-        more = Seen(asked[got], np.full(np.count_nonzero(got), k), match.found[got], match.level[got])
-        m = with_seen(m, more)
+        got = match.matched
+        m = with_seen(m, Seen(asked[got], np.full(match.found_count, k), match.found[got], match.level[got]))
     return m
 
 
