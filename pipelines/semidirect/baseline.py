@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -26,7 +26,8 @@ from pipelines.correlation.odometry import eight_bit
 from pipelines.estimator import EstimatorError, FrameImage, Images
 from pipelines.geometry import se3_exp, se3_inverse, se3_log, se3_product, so3_exp, wrap_angle
 from pipelines.semidirect import baseline_map, epipolar, scale
-from pipelines.semidirect.baseline_map import Adjusted, Growth, Map, Seen
+from pipelines.semidirect.baseline_map import Growth, Map, Seen
+from pipelines.semidirect.baseline_records import Notes, Tracked, nothing, of_bundles, of_map, of_tracking
 from pipelines.semidirect.baseline_search import (
     Matches,
     SearchOptions,
@@ -38,13 +39,13 @@ from pipelines.semidirect.baseline_search import (
     view_of,
 )
 from pipelines.semidirect.baseline_settings import BaselineSettings
-from pipelines.semidirect.baseline_step import STAGES, BaselineStep
+from pipelines.semidirect.baseline_step import BaselineStep
 from pipelines.semidirect.features import FeatureOptions
 from pipelines.semidirect.optics import Optics, optics_of, rays
 from pipelines.semidirect.pyramid import Grey, level_image
 from pipelines.semidirect.refinement import BundleOptions, PoseOptions, RefinedPose, refine_pose
 from pipelines.semidirect.start import Start, StartLimits, StartOutcome, start
-from pipelines.semidirect.step import Feature, Stage
+from pipelines.semidirect.step import Stage
 from pipelines.verdict import Verdict, gravest
 from readers.streams import ImageError, ImageSample, Problem, Sample, StreamKind
 
@@ -52,8 +53,6 @@ Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 T = TypeVar("T")
-Notes = dict[str, Any]
-"""Fields of the frame's Step, by name."""
 
 INTERVALS = 15
 """Frames whose intervals make the running median."""
@@ -86,34 +85,6 @@ class Unit(NamedTuple):
     known: bool
     metres: float
     sigma: float
-
-
-class Tracked(NamedTuple):
-    """What tracking made of a frame.
-
-    `prior` and `coarse` are poses [4, 4] before and after the coarse step; `rows` [M] the points of the fine step with
-    their `match`, errors and whether they agree with the `pose`, which is None where too few were matched.
-    """
-
-    prior: Floats
-    coarse: Floats
-    coarse_tried: int
-    coarse_found: int
-    rows: Longs
-    match: Matches
-    pose: RefinedPose | None
-    error_px: Floats
-    inlier: Flags
-
-    @property
-    def agreeing(self) -> int:
-        """Points that agree with the pose."""
-        return int(np.count_nonzero(self.inlier))
-
-    @property
-    def share(self) -> float:
-        """Their share of the points that were looked for."""
-        return self.agreeing / max(len(self.rows), 1)
 
 
 @dataclass(frozen=True, slots=True)
@@ -344,7 +315,7 @@ class BaselineOdometry:
         m = baseline_map.with_new_points(baseline_map.with_points(m, points, seen), optics, self._growth)
         depth = float(np.median(_depths(pose, points)))
         notes |= {"tracked": len(points), "keyframe": 1, "points_added": len(m.points), "scene_depth_m": depth}
-        notes |= _structure(m, optics, 1.0)
+        notes |= of_map(m, optics, 1.0)
         velocity = se3_log(second_T_first) / ((now.t_ns - trail.t_ns) * 1e-9)
         return replace(
             now,
@@ -372,7 +343,7 @@ class BaselineOdometry:
         if not self._holds(tracked, s.good_share if now.lost_frames else s.lost_share):
             found = self._relocalised(now, notes)
             if found is None:
-                notes |= _track_notes(m, tracked) | {"pose_sigma": np.full(6, math.nan)}
+                notes |= of_tracking(m, tracked) | {"pose_sigma": np.full(6, math.nan)}
                 return self._lost(now), None, Stage.LOST, Verdict.LOST
             tracked, stage, alarms = found, Stage.RELOCALISED, Verdict.REACQUIRED
         refined = _known(tracked.pose)
@@ -387,7 +358,7 @@ class BaselineOdometry:
             lost_frames=0,
             relocalised_frames=0 if stage is Stage.RELOCALISED else now.relocalised_frames,
         )
-        notes |= _track_notes(m, tracked)
+        notes |= of_tracking(m, tracked)
         return now, tracked, stage, alarms
 
     def _track(self, now: BaselineState, prior: Floats) -> Tracked:
@@ -498,8 +469,8 @@ class BaselineOdometry:
             "keyframe": 1,
             "points_added": m.made - made,
             "points_removed": count + m.made - made - len(m.points),
-            **_bundle_notes(adjusted),
-            **_structure(m, optics, _known(tracked.pose).scale_px),
+            **of_bundles(adjusted),
+            **of_map(m, optics, _known(tracked.pose).scale_px),
         }
         return replace(now, map=m, pose=m.poses[-1], guess=m.poses[-1], since_bundle=since)
 
@@ -522,7 +493,7 @@ class BaselineOdometry:
         moved = np.where(np.isfinite(moved), moved, 0.0)
         size = (math.nan, math.nan) if now.view is None else (now.view.pyramid.width, now.view.pyramid.height)
         values: Notes = {
-            **_nothing(),
+            **nothing(),
             "frame": _frame_of(before, sample),
             "t_ns": sample.t_ns,
             "received_ns": sample.received_ns,
@@ -666,102 +637,3 @@ def _published(settings: BaselineSettings, pose: Floats | None) -> tuple[Floats,
         return _start_position(settings), np.full(4, math.nan), np.array(settings.start_pose)
     world_T_cam = se3_inverse(pose)
     return world_T_cam[:3, 3], Rotation.from_matrix(world_T_cam[:3, :3]).as_quat(), np.array(_planar(settings, pose))
-
-
-# --------------------------------------------------------------------------------------- notes
-
-
-def _nothing() -> Notes:
-    """The fields of a frame in which nothing was found."""
-    nan, none = math.nan, np.zeros(0, np.int64)
-    return {
-        "pose_sigma": np.full(6, nan),
-        "tracked": 0,
-        "keyframe": 0,
-        "scene_depth_m": nan,
-        "point_id": none,
-        "predicted_px": np.zeros((0, 2)),
-        "found_px": np.zeros((0, 2)),
-        "level": none,
-        "outcome": none,
-        "error_px": np.zeros(0),
-        "score": np.zeros(0),
-        "keyframe_number": none,
-        "keyframe_position_m": np.zeros((0, 3)),
-        "keyframe_quat_xyzw": np.zeros((0, 4)),
-        "map_id": none,
-        "map_point_m": np.zeros((0, 3)),
-        "map_point_sigma_m": np.zeros(0),
-        "map_point_views": none,
-        "prior_position_m": np.full(3, nan),
-        "corners": 0,
-        "coarse_tried": 0,
-        "coarse_found": 0,
-        "coarse_position_m": np.full(3, nan),
-        "pose_scale_px": nan,
-        "keyframe_distance": nan,
-        "points_added": 0,
-        "points_removed": 0,
-        "bundle_keyframes": np.zeros(2, np.int64),
-        "bundle_iterations": np.zeros(2, np.int64),
-        "bundle_cost": np.full((2, 2), nan),
-        "bundle_outliers": np.zeros(2, np.int64),
-        "start_matches": 0,
-        "start_motion_px": nan,
-        "start_parallax_px": nan,
-        "relocalise_keyframe": -1,
-        "relocalise_correlation": nan,
-        "stage_ms": np.full(len(STAGES), nan),
-    }
-
-
-def _track_notes(m: Map, tracked: Tracked) -> Notes:
-    match, pose = tracked.match, tracked.pose
-    outlier = match.matched & ~tracked.inlier
-    return {
-        "tracked": tracked.agreeing,
-        "pose_sigma": np.full(6, math.nan) if pose is None else np.sqrt(np.diag(pose.covariance)),
-        "pose_scale_px": math.nan if pose is None else pose.scale_px,
-        "point_id": m.ids[tracked.rows],
-        "predicted_px": match.predicted,
-        "found_px": match.found,
-        "level": match.level,
-        "outcome": np.where(outlier, Feature.OUTLIER, match.outcome),
-        "error_px": tracked.error_px,
-        "score": match.score,
-        "prior_position_m": se3_inverse(tracked.prior)[:3, 3],
-        "coarse_position_m": se3_inverse(tracked.coarse)[:3, 3],
-        "coarse_tried": tracked.coarse_tried,
-        "coarse_found": tracked.coarse_found,
-    }
-
-
-def _structure(m: Map, optics: Optics, sigma_px: float) -> Notes:
-    """Keyframes and points as the Step tells them, for errors of so many px."""
-    worlds = np.array([se3_inverse(pose) for pose in m.poses])
-    return {
-        "keyframe_number": m.frames,
-        "keyframe_position_m": worlds[:, :3, 3],
-        "keyframe_quat_xyzw": Rotation.from_matrix(worlds[:, :3, :3]).as_quat(),
-        "map_id": m.ids,
-        "map_point_m": m.points,
-        "map_point_sigma_m": baseline_map.sigma_along_rays(m, optics, sigma_px),
-        "map_point_views": np.diff(m.first),
-    }
-
-
-def _bundle_notes(adjusted: Sequence[Adjusted]) -> Notes:
-    """What the local and the global bundle did."""
-    keyframes, iterations, outliers = np.zeros((3, 2), np.int64)
-    cost = np.full((2, 2), math.nan)
-    for i, (_, bundle, dropped) in enumerate(adjusted):
-        if bundle is not None:
-            keyframes[i] = np.count_nonzero(np.any(bundle.covariance != 0, axis=(1, 2)))
-            iterations[i], outliers[i] = bundle.iterations, dropped
-            cost[i] = bundle.cost[[0, bundle.iterations]]
-    return {
-        "bundle_keyframes": keyframes,
-        "bundle_iterations": iterations,
-        "bundle_cost": cost,
-        "bundle_outliers": outliers,
-    }
