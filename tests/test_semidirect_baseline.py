@@ -344,6 +344,13 @@ def test_a_state_is_adopted_by_the_same_camera_only() -> None:
         odometry(focal_px=300.0).adopted(state)
 
 
+def test_times_are_told_only_when_asked_for() -> None:
+    assert all(np.all(np.isnan(s.stage_ms)) for s in usual())
+    _, steps = flown(odometry(stage_times=True), flight()[0][:20])
+    assert all(np.all(s.stage_ms >= 0) for s in steps)
+    assert np.median([s.stage_ms[1] for s in steps[15:]]) > 0.1
+
+
 # -------------------------------------------------------------------------------------- parts
 
 

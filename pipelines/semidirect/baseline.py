@@ -220,16 +220,15 @@ class BaselineOdometry:
         if state.intervals and dt_s > self._settings.gap_factor * float(np.median(state.intervals)):
             alarms |= Verdict.FRAME_GAP
         image_ms = lap()
+        tracked = None
         if now.map is None:
             now, stage, found = self._starting(now, notes)
-            track_ms, map_ms = lap(), math.nan
         else:
             now, tracked, stage, found = self._tracking(now, notes)
-            track_ms, map_ms = lap(), math.nan
-            if tracked is not None:
-                now = self._mapping(now, tracked, notes)
-                map_ms = lap()
-        notes["stage_ms"] = np.array([image_ms, track_ms, map_ms])
+        track_ms = lap()
+        if tracked is not None:
+            now = self._mapping(now, tracked, notes)
+        notes["stage_ms"] = np.array([image_ms, track_ms, lap()])
         return now, self._record(state, now, sample, stage, alarms | found, notes)
 
     def _view(self, grey: Grey) -> View:
