@@ -277,7 +277,7 @@ class BaselineOdometry:
         }
         now = replace(now, trail=trail)
         if solved.outcome is not StartOutcome.STARTED:
-            return now, Stage.STARTING, alarms or Verdict.LOW_PARALLAX
+            return now, Stage.STARTING, alarms or Verdict.STARTING
         return self._first_map(now, trail, solved, notes), Stage.STARTED, Verdict.OK
 
     def _first_map(self, now: BaselineState, trail: Trail, solved: Start, notes: Notes) -> BaselineState:
@@ -344,7 +344,7 @@ class BaselineOdometry:
             if found is None:
                 notes |= of_tracking(m, tracked) | {"pose_sigma": np.full(6, math.nan)}
                 return self._lost(now), None, Stage.LOST, Verdict.LOST
-            tracked, stage, alarms = found, Stage.RELOCALISED, Verdict.REACQUIRED
+            tracked, stage, alarms = found, Stage.RELOCALISED, Verdict.RELOCALISED
         refined = _known(tracked.pose)
         moved = se3_log(se3_product(refined.cam_t_world, se3_inverse(pose)))
         now = replace(
@@ -490,6 +490,7 @@ class BaselineOdometry:
         held, _, planar_before = _published(s, before.pose)
         moved = position - held if before.pose is not None else position - _start_position(s)
         moved = np.where(np.isfinite(moved), moved, 0.0)
+        alarms |= _standing(now, stage)
         size = (math.nan, math.nan) if now.view is None else (now.view.pyramid.width, now.view.pyramid.height)
         values: Notes = {
             **nothing(),
@@ -552,6 +553,18 @@ def levelled(up_in_cam: Floats, heading_rad: float, position_m: Floats) -> Float
     world_T_cam[:3, :3] = so3_exp(np.array([0.0, 0.0, heading_rad])) @ in_cam.T
     world_T_cam[:3, 3] = position_m
     return world_T_cam
+
+
+def _standing(now: BaselineState, stage: Stage) -> Verdict:
+    """What holds of a frame's pose for as long as the map lasts."""
+    alarms = Verdict.OK
+    if stage is Stage.STARTED and now.map_number > 0:
+        alarms |= Verdict.NEW_MAP
+    if stage in (Stage.STARTED, Stage.TRACKED, Stage.RELOCALISED) and not now.unit.known:
+        alarms |= Verdict.SCALE_UNKNOWN
+    if now.relocalised_frames > 0 and stage is not Stage.SKIPPED:
+        alarms |= Verdict.AFTER_RELOCALISATION
+    return alarms
 
 
 def _known(value: T | None) -> T:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Annotated, Self
 
 from pydantic import Field, model_validator
@@ -43,7 +44,9 @@ class BaselineSettings(CameraSettings):
     fine_points: Count = Field(1000, description="most points of the fine step")
     fine_px: Positive = Field(5.0, description="its search radius, twice that without a coarse step")
     max_score: Positive = Field(1500.0, description="worst mean squared difference of a match, grey levels²")
-    max_score_share: Positive = Field(0.5, description="the same as a share of the patch's variance")
+    max_score_share: Positive = Field(
+        math.inf, description="the same as a share of the patch's variance; PTAM has no such limit"
+    )
     align_level: Level = Field(
         3, description="matches of the fine step on this level and coarser are aligned to a part of a pixel"
     )
@@ -75,6 +78,22 @@ class BaselineSettings(CameraSettings):
     # verdicts, how it runs
     gap_factor: Positive = Field(1.6, description="FRAME_GAP above this multiple of the running median of dt")
     stage_times: bool = Field(False, description="log the time of each stage (not reproducible)")
+
+    @classmethod
+    def presets(cls) -> tuple[str, ...]:
+        """The names of the presets."""
+        return ("published", "strict")
+
+    @classmethod
+    def preset(cls, name: str) -> BaselineSettings:
+        """The settings of that name: ``published`` as PTAM is, ``strict`` refuses matches that are hardly alike.
+
+        Raises:
+            KeyError: there is no preset of that name.
+        """
+        if name not in cls.presets():
+            raise KeyError(name)
+        return cls(max_score_share=0.5) if name == "strict" else cls()
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:
