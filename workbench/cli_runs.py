@@ -1,4 +1,4 @@
-"""The commands about finished runs: explain, compare, report, check, sweep, export.
+"""The commands about finished runs: explain, consistency, compare, report, check, sweep, export.
 
 `workbench.cli` takes them up; what is said there of output and exit statuses holds here, and one more: 4, an
 expectation of ``check`` is not met.
@@ -34,8 +34,10 @@ from workbench.terminal import (
 if TYPE_CHECKING:
     from workbench.check import Checked
     from workbench.compare import Comparison, Parting
+    from workbench.consistency import Consistency
     from workbench.diagnosis.finding import Finding
     from workbench.explain import Explanation, Quantity
+    from workbench.judgement import Judgement
     from workbench.runs import Run
 
 LINE = 110
@@ -61,6 +63,7 @@ def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     for command, short, lines in (
         (explain, "Why a frame is as it is: a screenful about it.", EXPLAIN),
+        (consistency, "What a run says of its own drift, without a reference.", CONSISTENCY),
         (compare, "Runs side by side, and where they part.", COMPARE),
         (report, "Make a page that tells what a run concluded, what failed, and why.", REPORT),
         (check, "Hold runs against expectations, for CI.", CHECK),
@@ -95,8 +98,9 @@ def explain(
 ) -> None:
     """Explain frames: verdict, every intermediate with its unit, what is unusual in this run, neighbours, findings.
 
-    Without a choice it is the worst frame: the one that did the most harm where there is a reference, else the one of
-    the gravest verdict. How unusual a number is, is told in robust standard deviations (σ) from the run's median.
+    Without a choice it is the worst frame: the one that did the most harm where a reference or the command consistency
+    tells it, else the one of the gravest verdict. How unusual a number is, is told in robust standard deviations (σ)
+    from the run's median.
     """
     from workbench.explain import explain as explained
     from workbench.judgement import judged
@@ -107,12 +111,13 @@ def explain(
     frames = _chosen_frames(opened, frame, at, worst, judgement.harm_m)
     told = [explained(opened, number, findings=judgement.findings, harm_m=judgement.harm_m) for number in frames]
     if as_json:
-        print_json({"run": str(opened.file), "frames": [_explanation_values(one) for one in told]})
+        about = {"run": str(opened.file), "harm_from": judgement.harm_from, "note": judgement.note}
+        print_json({**about, "frames": [_explanation_values(one) for one in told]})
     elif not told:
         print(f"{shown(str(opened.file))}: no frame of this run is out of the ordinary")
     for number, one in enumerate(told if not as_json else ()):
         print("\n" + "=" * LINE if number else "", end="\n" if number else "")
-        _print_explanation(opened, one)
+        _print_explanation(opened, one, judgement)
     if open_viewer and told:
         _open_at(opened, told[0])
 
@@ -136,9 +141,10 @@ def _chosen_frames(run: Run, frame: int | None, at: str | None, worst: int | Non
     return worst_frames(run, worst or 1, harm_m)
 
 
-def _print_explanation(run: Run, one: Explanation) -> None:
+def _print_explanation(run: Run, one: Explanation, judgement: Judgement) -> None:
     """A screenful."""
     from workbench.explain import NOT_JUDGED, brief, number, unit_of
+    from workbench.judgement import WHOLES
 
     print(
         f"frame {one.frame} of {shown(str(run.file))} ({shown(one.estimator)}), {one.since_start_s:.3f} s after its "
@@ -152,7 +158,9 @@ def _print_explanation(run: Run, one: Explanation) -> None:
         x, y, distance, heading = one.error
         print(f"error against the reference: {distance:.4g} m (x {x:+.4g}, y {y:+.4g}), {math.degrees(heading):+.4g}°")
     if math.isfinite(one.harm_m):
-        print(f"harm: this frame adds {one.harm_m:+.4g} m to the error at the end")
+        print(f"harm: this frame adds {one.harm_m:+.4g} m to {WHOLES[judgement.harm_from]}")
+    if judgement.note:
+        print(f"harm: not told: {shown(judgement.note)}")
     for finding in one.findings:
         print(f"finding {finding.rule} ({_spans(finding.spans)}): {shown(finding.sentence)}")
         print(f"  cause: {shown(finding.cause)}\n  try: {shown(finding.remedy)}")
@@ -274,6 +282,89 @@ def _open_at(run: Run, one: Explanation) -> None:
         print("There is no display here: open the run on a machine with one, with workbench view.", file=sys.stderr)
         return
     raise typer.Exit(show_at(files_of([run.file]), one.frame))
+
+
+# ---------------------------------------------------------------------------- consistency
+
+
+CONSISTENCY = (
+    "workbench consistency results/mission",
+    "workbench consistency results/mission/best.rrd --worst 20",
+    "workbench consistency results/mission --json | jq .loops[0]",
+)
+
+
+def consistency(
+    run: RunPath,
+    worst: Annotated[int, typer.Option("--worst", metavar="K", min=1, help="How many frames and loops to print.")] = 8,
+    as_json: AsJson = False,
+) -> None:
+    """Hold a run against itself: replay it backward, and look again at the places that its path came back to.
+
+    Needs no reference and no original log. Frames whose motion the backward replay does not undo are named, the one
+    that moves the end the furthest first. What both replays have alike, such as a wrong scale, stays unseen. The answer
+    is kept in RUN.consistency.json; explain and report take the harm of frames from it where there is no reference.
+    """
+    from workbench.consistency import consistency as held
+    from workbench.consistency import values_of, write
+    from workbench.judgement import judged
+    from workbench.runs import open_run
+
+    opened = open_run(run)
+    with Bars() as bars:
+        found = held(opened, bars)
+    file = write(opened, found)
+    if as_json:
+        print_json({**values_of(found), "file": str(file)})
+    else:
+        _print_consistency(opened, found, judged(opened).findings, worst)
+        print(f"\nwritten      {shown(str(file))}")
+
+
+def _print_consistency(run: Run, found: Consistency, findings: Sequence[Finding], worst: int) -> None:
+    from workbench.explain import number
+
+    unit, share = found.unit, 100 * found.end_m / found.path_m if found.path_m > 0 else math.nan
+    print(
+        f"backward     the two replays end {number(found.end_m)} {unit} apart, {number(share)} % of the path, "
+        f"turned by {number(math.degrees(found.end_rad))}°"
+    )
+    print(f"             the median frame moves the end by {number(found.usual_m)} {unit}; those that move it most:\n")
+    heads = ("frame", f"by, {unit}", "of the median", "verdict", "finding")
+    print("\n".join(table(heads, _frame_rows(run, found, findings, worst), right=(0, 1, 2))))
+    print(f"\nloops        {_loops_line(found)}")
+    if found.loops:
+        rows = [
+            (f"{one.first_frame} – {one.second_frame}", number(one.loop_m), number(one.drift_m),
+             number(100 * one.drift_m / one.loop_m), number(math.degrees(one.drift_rad)))
+            for one in found.loops[:worst]
+        ]  # fmt: skip
+        heads = ("frames", f"path, {unit}", f"drift, {unit}", "% of it", "turned, °")
+        print("\n" + "\n".join(table(heads, rows, right=range(1, 5))))
+    for stretch in found.suspects[:1]:
+        print(
+            f"\n             one error after frame {stretch.after_frame} and up to {stretch.last_frame} would explain "
+            f"{max(0, round(100 * stretch.explained))} % of the loops' drift, more than anywhere else"
+        )
+
+
+def _frame_rows(run: Run, found: Consistency, findings: Sequence[Finding], worst: int) -> Iterable[tuple[str, ...]]:
+    from workbench.explain import number
+
+    for row in found.ranked()[:worst].tolist():
+        frame, size = int(found.frame[row]), float(found.size_m[row])
+        times = f"{number(size / found.usual_m)} x" if found.usual_m > 0 else ""
+        named = ", ".join(finding.rule for finding in findings if finding.covers(frame))
+        yield str(frame), number(size), times, str(run.verdicts[run.row_of(frame)].name), named
+
+
+def _loops_line(found: Consistency) -> str:
+    if found.loops_why:
+        return f"not looked for: {found.loops_why}"
+    if not found.revisits:
+        return "the path does not come back to any place"
+    places = f"{found.revisits} place" + "s" * (found.revisits != 1)
+    return f"{places} come back to; at {len(found.loops)} the images tell the motion between the visits"
 
 
 # -------------------------------------------------------------------------------- compare
