@@ -41,6 +41,8 @@ if TYPE_CHECKING:
     from workbench.runs import Run
 
 LINE = 110
+EXPLAINED = 0.5
+"""One error counts as the source of the loops' drift where it explains that share of it."""
 MOST_ODD = 14
 ERRORS = ("x_m", "y_m", "distance_m", "heading_rad")
 COMPARED = (
@@ -341,11 +343,17 @@ def _print_consistency(run: Run, found: Consistency, findings: Sequence[Finding]
         ]  # fmt: skip
         heads = ("frames", f"path, {unit}", f"drift, {unit}", "% of it", "turned, °")
         print("\n" + "\n".join(table(heads, rows, right=range(1, 5))))
-    for stretch in found.suspects[:1]:
-        print(
-            f"\n             one error after frame {stretch.after_frame} and up to {stretch.last_frame} would explain "
-            f"{max(0, round(100 * stretch.explained))} % of the loops' drift, more than anywhere else"
-        )
+    if found.suspects:
+        print(f"\n             {_suspicion(found)}")
+
+
+def _suspicion(found: Consistency) -> str:
+    """Where the drift of the loops may come from."""
+    spans, explained = found.suspicion()
+    share = f"{max(0, round(100 * explained))} % of the loops' drift"
+    if explained < EXPLAINED:
+        return f"no single error explains it, the likeliest one {share}: it is spread along the path"
+    return f"one error in {_spans(spans)} would explain {share}; nothing tells more closely where"
 
 
 def _frame_rows(run: Run, found: Consistency, findings: Sequence[Finding], worst: int) -> Iterable[tuple[str, ...]]:

@@ -41,6 +41,8 @@ WITHIN_SHARE = 0.3
 """Frames whose places differ by less than this share of the shorter side of the image show the same ground."""
 LOOP_TIMES = 10
 """A loop is at least so many times as long as its ends may lie apart."""
+ALIKE = 0.05
+"""Stretches whose explained shares of the loops' drift differ by less are not told apart."""
 AGAIN = "run workbench consistency again"
 
 
@@ -118,6 +120,21 @@ class Consistency:
     def ranked(self) -> Ints:
         """The compared frames by how far they move the end, the furthest first: rows of `frame` [m]."""
         return np.argsort(-self.size_m, kind="stable").astype(np.int64)
+
+    def suspicion(self) -> tuple[list[tuple[int, int]], float]:
+        """Frames, as spans of first and last, one error in which would explain the loops' drift, and its share of it.
+
+        Stretches that explain nearly as much as the likeliest one cannot be told from it, and count as well.
+        """
+        best = max((one.explained for one in self.suspects), default=math.nan)
+        alike = [one for one in self.suspects if one.explained >= best - ALIKE]
+        spans: list[tuple[int, int]] = []
+        for one in sorted(alike, key=lambda one: one.after_frame):
+            if spans and spans[-1][1] == one.after_frame:
+                spans[-1] = (spans[-1][0], one.last_frame)
+            else:
+                spans.append((one.after_frame + 1, one.last_frame))
+        return spans, best
 
 
 # -------------------------------------------------------------------------------- the answer
