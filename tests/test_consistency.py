@@ -273,7 +273,10 @@ def test_a_reference_comes_before_the_backward_replay(folder: Path, tmp_path: Pa
             lambda folder: _replaced(folder / "sensors.toml", 'digest = "', 'digest = "0'),
             "sensors.rrd: is of another recording than best",
         ),
-        (lambda folder: _replaced(folder / "sensors.toml", "stride = 1", "stride = 2"), "was written again for another"),
+        (
+            lambda folder: _replaced(folder / "sensors.toml", "stride = 1", "stride = 2"),
+            "was written again for another",
+        ),
     ],
 )
 def test_runs_without_their_samples_are_refused(
