@@ -192,7 +192,7 @@ def test_a_file_of_another_replay_is_told_and_not_used(blurred: Run, found: Cons
     toml = blurred.path("toml")
     toml.write_text(toml.read_text() + "# replayed again\n")
     again = open_run(blurred.folder)
-    with pytest.raises(RecordingError, match="of another replay than best.rrd; run workbench consistency again"):
+    with pytest.raises(RecordingError, match=r"of another replay than best\.rrd; run workbench consistency again"):
         read(again)
     judgement = judged(again)
     assert judgement.harm_m is None
