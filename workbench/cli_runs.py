@@ -128,7 +128,6 @@ def _chosen_frames(run: Run, frame: int | None, at: str | None, worst: int | Non
     """The frames that are asked for."""
     from readers.streams import WorkbenchError
     from workbench.explain import worst_frames
-    from workbench.inputs import parse_time
 
     if sum(choice is not None for choice in (frame, at, worst)) > 1:
         raise WorkbenchError("give one of --frame, --time and --worst")
@@ -136,6 +135,8 @@ def _chosen_frames(run: Run, frame: int | None, at: str | None, worst: int | Non
         run.row_of(frame)
         return [frame]
     if at is not None:
+        from workbench.inputs import parse_time
+
         t_ns, first, last = parse_time(at, int(run.t_ns[0])), int(run.t_ns[0]), int(run.t_ns[-1])
         if not first <= t_ns <= last:
             raise WorkbenchError(f"--time {at}: the run lasts from 0 to {(last - first) / 1e9:.3f} s ({moment(first)})")

@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from pipelines.estimator import Estimator, EstimatorError, Resumable, Step
-from pipelines.geometry import wrap_angle
+from pipelines.planar import wrap_angle
 from pipelines.replay import stepped
 from pipelines.verdict import Verdict, flags
 from readers.streams import RecordingError, Sample, StreamError
