@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from workbench.options import EstimatorName, PresetName, SettingsFile, StartTime, StopTime, Stride
 from workbench.terminal import (
     IN_PART,
     INTERRUPTED,
@@ -633,15 +634,15 @@ def sweep(
         list[str] | None,
         typer.Option("--grid", metavar="KEY=A,B,C", help="A setting (or preset) and its values; repeatable."),
     ] = None,
-    estimator: Annotated[str, typer.Option("--estimator", "-e", help="Name of the estimator.")] = "correlation",
-    preset: Annotated[str | None, typer.Option(help="Preset of its settings.")] = None,
-    settings: Annotated[Path | None, typer.Option(metavar="FILE", help="Settings over the preset.")] = None,
+    estimator: EstimatorName = "correlation",
+    preset: PresetName = None,
+    settings: SettingsFile = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting of all replays; repeatable.")
     ] = None,
-    start: Annotated[str | None, typer.Option("--from", metavar="T", help="Begin, as replay takes it.")] = None,
-    stop: Annotated[str | None, typer.Option("--to", metavar="T", help="End (excluded).")] = None,
-    stride: Annotated[int, typer.Option(help="Use every n-th frame.")] = 1,
+    start: StartTime = None,
+    stop: StopTime = None,
+    stride: Stride = 1,
     image: Annotated[str | None, typer.Option(metavar="TOPIC", help="Image stream.")] = None,
     reference: Annotated[str | None, typer.Option(metavar="TOPIC", help="Stream to compare with, or none.")] = None,
     height: Annotated[str | None, typer.Option(metavar="TOPIC", help="Stream of the camera's height.")] = None,
