@@ -168,7 +168,7 @@ def _backward_drift(run: Run) -> Drift | None:
         found.shift_m,
         found.heading_m,
         found.end_m,
-        "There is no reference: a frame is held against the backward replay, in which it may be the wrong one as well.",
+        "Without a reference a frame is held against the backward replay, in which it may be the wrong one as well.",
         BACKWARD,
     )
 
