@@ -128,6 +128,11 @@ def _ros_decoder(
     return decode
 
 
+def has_fixed_layout(decode: Decoder) -> bool:
+    """Whether it decodes ROS 1 messages of a standard definition, whose layout is known."""
+    return isinstance(decode, partial) and decode.func is _decode_fixed
+
+
 def _decode_fixed(decode: Decoder, type_name: str, data: Buffer) -> Any:
     try:
         return decode(data)

@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from readers.clock import REORDER_WINDOW_NS, SECOND_NS, merge, reorder, sane_stamp
-from readers.decoding import Decoder, Definitions, MessageError, decoder_of, definition_text
+from readers.decoding import Decoder, Definitions, MessageError, decoder_of, definition_text, has_fixed_layout
 from readers.fixed_layout import FixedReader, fixed_reader, header_of
 from readers.fixed_rows import read_rows
 from readers.message_log import Buffer, Channel, Message, MessageLog, Source, in_log_order
@@ -115,7 +115,9 @@ class Topic:
 
     def rows(self, messages: Sequence[Message]) -> Sequence[Sample | None]:
         """The samples of messages of one channel, as far as they can be made together; none, or None, for others."""
-        if messages[0].channel not in self.fixed or not self.trust_stamps or self.clock is not Clock.HEADER:
+        channel = messages[0].channel
+        known = channel in self.fixed or has_fixed_layout(self.decoders[channel])
+        if not known or not self.trust_stamps or self.clock is not Clock.HEADER:
             return ()
         return read_rows(messages, self.name, self.offset_ns)
 
