@@ -1,4 +1,4 @@
-"""CDR messages that are numbers behind texts, many at a time → samples.
+"""Messages of CDR and ROS 1 that are numbers behind texts, many at a time → samples.
 
 As long as its texts have the same length, the messages of a channel have one length and are the rows of one array.
 Rows of which there is something to note or to mend are left to the reading of single messages, `readers.fixed_layout`.
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from readers import ros1_wire
 from readers.clock import DAY_NS
 from readers.decoding import ros_name
 from readers.fixed_layout import imu_numbers_at, odometry_numbers_at
@@ -39,15 +40,17 @@ class _Rows(NamedTuple):
 
 def _rows_of(messages: Sequence[Message]) -> _Rows | None:
     """The numbers of messages of one channel that has a fixed layout; None if they are not rows of one layout."""
-    kind = _KINDS.get(ros_name(messages[0].channel.type).replace("/msg/", "/"))
-    first = messages[0].data
+    channel, first = messages[0].channel, messages[0].data
+    kind = _KINDS.get((channel.encoding, ros_name(channel.type).replace("/msg/", "/")))
     if kind is None or (at := kind.numbers_at(first)) is None:
         return None
     data = [message.data for message in messages]
     if set(map(len, data)) != {len(first)}:
         return None
     table = np.frombuffer(b"".join(data), _row_type(len(first), at))
-    if np.any(table["mark"] != table["mark"][0]) or np.any(table["texts"] != table["texts"][0]):
+    if np.any(table["texts"] != table["texts"][0]):
+        return None
+    if channel.encoding == "cdr" and np.any(table["mark"] != table["mark"][0]):  # ROS 1 has a number there
         return None
     try:
         received_ns = np.array([message.log_ns for message in messages], np.int64)
@@ -175,7 +178,11 @@ class _Kind(NamedTuple):
     columns: Callable[[FloatArray], Columns]
 
 
+_IMU = _Kind(ImuSample, imu_numbers_at, _plain_imu, _imu_columns)
+_ODOMETRY = _Kind(OdometrySample, odometry_numbers_at, _plain_odometry, _odometry_columns)
 _KINDS = {
-    "sensor_msgs/Imu": _Kind(ImuSample, imu_numbers_at, _plain_imu, _imu_columns),
-    "nav_msgs/Odometry": _Kind(OdometrySample, odometry_numbers_at, _plain_odometry, _odometry_columns),
+    ("cdr", "sensor_msgs/Imu"): _IMU,
+    ("cdr", "nav_msgs/Odometry"): _ODOMETRY,
+    ("ros1", "sensor_msgs/Imu"): _IMU._replace(numbers_at=ros1_wire.imu_numbers_at),
+    ("ros1", "nav_msgs/Odometry"): _ODOMETRY._replace(numbers_at=ros1_wire.odometry_numbers_at),
 }

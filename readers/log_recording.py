@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 
 from readers.clock import REORDER_WINDOW_NS, SECOND_NS, merge, reorder, sane_stamp
-from readers.decoding import Decoder, Definitions, MessageError, decoder_of, definition_text
+from readers.decoding import Decoder, Definitions, MessageError, decoder_of, definition_text, has_fixed_layout
 from readers.extras import Extras
 from readers.fixed_layout import FixedReader, fixed_reader, header_of
 from readers.fixed_rows import fill_rows, read_rows
@@ -53,7 +53,7 @@ from readers.streams import (
 
 SLACK_NS = 2 * SECOND_NS
 FIRST_MESSAGES = 10
-BATCH_BYTES = 1 << 20
+BATCH_BYTES = 1 << 21
 BATCH_MESSAGES = 256
 FEWEST_ROWS = 4
 FRAME_SEARCH_NS = 30 * SECOND_NS
@@ -117,14 +117,24 @@ class Topic:
 
     def rows(self, messages: Sequence[Message]) -> Sequence[Sample | None]:
         """The samples of messages of one channel, as far as they can be made together; none, or None, for others."""
-        if not self.has_rows or messages[0].channel not in self.fixed:
+        if not self.at_header_stamps or not self.known(messages[0].channel):
             return ()
         return read_rows(messages, self.name, self.offset_ns)
 
     @property
+    def at_header_stamps(self) -> bool:
+        """Whether samples are of the time of their headers, as messages that are decoded together have to be."""
+        return self.trust_stamps and self.clock is Clock.HEADER
+
+    @property
     def has_rows(self) -> bool:
         """Whether messages can be decoded together: those of a fixed layout, at their header stamps."""
-        return bool(self.fixed) and self.trust_stamps and self.clock is Clock.HEADER
+        return self.at_header_stamps and any(map(self.known, self.channels))
+
+    def known(self, channel: Channel) -> bool:
+        """Whether the layout of a channel's messages is known."""
+        decode = self.decoders.get(channel)
+        return channel in self.fixed or (decode is not None and has_fixed_layout(decode))
 
     def array(self, messages: Sequence[Message], columns: np.dtype[np.void]) -> StructuredArray:
         """The samples of messages as rows, as `readers.sample_arrays` has them, in the order of the messages."""
@@ -134,7 +144,7 @@ class Topic:
         rows = blank(len(messages), columns)
         for channel, own in places.items():
             written = np.zeros(len(own), bool)
-            if channel in self.fixed:
+            if self.known(channel):
                 together = blank(len(own), columns)
                 written = fill_rows([messages[place] for place in own], self.offset_ns, together)
                 rows[np.array(own)[written]] = together[written]

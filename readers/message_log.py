@@ -38,6 +38,10 @@ class DamagedBlockError(Exception):
     """Stored bytes that cannot be unpacked; the text is a clause that says why."""
 
 
+class MessageError(Exception):
+    """A message, or the definition of one, that cannot be used; the text is a clause that says why."""
+
+
 @dataclass(eq=False, slots=True)
 class Channel:
     """One source of messages: a topic, the type of its messages and how they are serialised.

@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from workbench import cli_patrol, cli_runs
+from workbench.options import EstimatorName, PresetName, SettingsFile, StartTime, StopTime, Stride
 from workbench.terminal import (
     FAULT,
     IN_PART,
@@ -422,19 +423,15 @@ def _print_losses(report: Mapping[str, Any]) -> None:
 )
 def replay(
     path: RecordingPath,
-    estimator: Annotated[str, typer.Option("--estimator", "-e", help="Name of the estimator.")] = "correlation",
-    preset: Annotated[str | None, typer.Option(help="Preset of its settings, such as best or paper-a.")] = None,
-    settings: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Settings over the preset: TOML, JSON, or a RUN.toml.")
-    ] = None,
+    estimator: EstimatorName = "correlation",
+    preset: PresetName = None,
+    settings: SettingsFile = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting over all; repeatable.")
     ] = None,
-    start: Annotated[
-        str | None, typer.Option("--from", metavar="T", help="Begin: seconds after the first frame, ns, or ISO 8601.")
-    ] = None,
-    stop: Annotated[str | None, typer.Option("--to", metavar="T", help="End (excluded), likewise.")] = None,
-    stride: Annotated[int, typer.Option(help="Use every n-th frame.")] = 1,
+    start: StartTime = None,
+    stop: StopTime = None,
+    stride: Stride = 1,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="DIR", help="Folder of the results [results/NAME].")
     ] = None,
@@ -653,7 +650,7 @@ def simulate(
     show: Annotated[bool, typer.Option("--show", help="Print it with all keys, a TOML file to start from.")] = False,
     replayed: Annotated[bool, typer.Option("--replay", help="Replay it without a file in between.")] = False,
     estimator: Annotated[str, typer.Option("--estimator", "-e", help="Estimator of --replay.")] = "correlation",
-    preset: Annotated[str | None, typer.Option(help="Preset of its settings, such as best or paper-a.")] = None,
+    preset: PresetName = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a simulated mission: write it as a recording, or replay it directly.
@@ -813,10 +810,8 @@ def sync(
     sensors: Annotated[
         list[str] | None, typer.Option("--with", metavar="TOPIC", help="IMU or odometry [all]; repeatable.")
     ] = None,
-    start: Annotated[
-        str | None, typer.Option("--from", metavar="T", help="Begin: seconds after the first frame, ns, or ISO 8601.")
-    ] = None,
-    stop: Annotated[str | None, typer.Option("--to", metavar="T", help="End (excluded), likewise.")] = None,
+    start: StartTime = None,
+    stop: StopTime = None,
     max_offset: Annotated[float, typer.Option(metavar="S", help="How far the clocks may be apart.")] = 1.0,
     picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the correlations.")] = None,
     clocks: Clocks = None,

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
-from pipelines.geometry import heading_of_quat
+from pipelines.planar import heading_of_quat
 from pipelines.ranging.step import RangeStep
 from pipelines.verdict import Severity, Verdict
 from readers.streams import ImageError, ImageSample, PoseSample, RecordingError, Sample

@@ -147,7 +147,6 @@ class SampleLog:
 
     def _send(self, entity: str, form: Form, rows: Sequence[Stored]) -> None:
         samples = [row.sample for row in rows]
-        numbers = [_numbers(form, sample) for sample in samples]
         components: dict[str, Any] = {
             "order": [row.order for row in rows],
             "received_ns": [sample.received_ns for sample in samples],
@@ -161,9 +160,10 @@ class SampleLog:
         columns: list[Any] = []
         if form.numbers and form.plotted:
             self._legend(entity, form)
-            columns += rr.Scalars.columns(scalars=np.concatenate(numbers)).partition([len(n) for n in numbers])
+            table = _table(form, samples)
+            columns += rr.Scalars.columns(scalars=table.ravel()).partition([table.shape[1]] * len(table))
         elif form.numbers:
-            lists["values"] = numbers
+            lists["values"] = [_numbers(form, sample) for sample in samples]
         columns += rr.DynamicArchetype.columns(ARCHETYPE, components=components)
         for name, values in lists.items():
             flat: Any = list(itertools.chain(*values)) if name == "texts" else np.concatenate(values)
@@ -197,7 +197,13 @@ class SampleLog:
 
 def _numbers(form: Form, sample: Sample) -> NDArray[np.float64]:
     parts = [np.asarray(getattr(sample, name), np.float64).ravel() for name, _ in form.numbers]
-    return np.concatenate(parts) if parts else np.empty(0)
+    return np.concatenate(parts)
+
+
+def _table(form: Form, samples: Sequence[Sample]) -> NDArray[np.float64]:
+    """The numbers of samples that all have as many of them [n, k]."""
+    parts = [np.array([getattr(sample, name) for sample in samples], np.float64) for name, _ in form.numbers]
+    return np.concatenate([part.reshape(len(samples), -1) for part in parts], axis=1)
 
 
 def _names(form: Form) -> Iterable[str]:
