@@ -28,6 +28,8 @@ LEAST_OVERLAP = 0.3
 """Share of the small image that both must show."""
 LEAST_CONTRAST = 1.0
 """Standard deviation of a small image, grey levels, below which there is nothing to lay over one another."""
+TURNS_RAD = (0.0, 0.2, -0.2, 0.4, -0.4)
+"""Rotations that the search for the first guess tries."""
 ITERATIONS = 100
 PRECISION = 1e-6
 TRIED = 3
@@ -98,7 +100,7 @@ def small_motion(reference: Grey, current: Grey) -> tuple[Floats, float]:
     one, two = (cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR_PX) for image in (reference, current))
     if min(one.std(), two.std()) < LEAST_CONTRAST:
         return np.full((2, 3), np.nan), np.nan
-    motion = _shift(one, two)
+    motion = max((_turned_shift(one, two, angle) for angle in TURNS_RAD), key=lambda found: found[0])[1]
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, ITERATIONS, PRECISION)
     try:
         _, motion = cv2.findTransformECC(one, two, motion, cv2.MOTION_EUCLIDEAN, stop)
@@ -107,13 +109,18 @@ def small_motion(reference: Grey, current: Grey) -> tuple[Floats, float]:
     return np.asarray(motion, np.float64), overlap_correlation(one, two, motion)
 
 
-def _shift(reference: NDArray[np.float32], current: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Where the middle of one image correlates best with the other, as a motion [2, 3] without rotation."""
+def _turned_shift(
+    reference: NDArray[np.float32], current: NDArray[np.float32], angle: float
+) -> tuple[float, NDArray[np.float32]]:
+    """Where the middle of one image, turned by an angle, correlates best with the other: that and the motion [2, 3]."""
     rows, columns = reference.shape
     top, left = rows // 4, columns // 4
-    middle = reference[top : rows - top, left : columns - left]
-    _, _, _, (u, v) = cv2.minMaxLoc(cv2.matchTemplate(current, middle, cv2.TM_CCOEFF_NORMED))
-    return np.array([[1, 0, u - left], [0, 1, v - top]], np.float32)
+    motion = cv2.getRotationMatrix2D(((columns - 1) / 2, (rows - 1) / 2), -np.degrees(angle), 1.0)
+    turned = cv2.warpAffine(reference, motion, (columns, rows), borderMode=cv2.BORDER_REFLECT)
+    middle = turned[top : rows - top, left : columns - left]
+    _, best, _, (u, v) = cv2.minMaxLoc(cv2.matchTemplate(current, middle, cv2.TM_CCOEFF_NORMED))
+    motion[:, 2] += (u - left, v - top)
+    return best, motion.astype(np.float32)
 
 
 def overlap_correlation(reference: NDArray[np.float32], current: NDArray[np.float32], motion: Any) -> float:
