@@ -1,10 +1,13 @@
 """The cheapest odometry over flat ground, as a peer: OpenCV's corners, optical flow and homographies.
 
 Corners of a keyframe (Shi, Tomasi, CVPR 1994) are followed from frame to frame (Bouguet's pyramidal Lucas-Kanade). A
-homography between the keyframe and the frame, H = R + t nᵀ/d, is found by RANSAC and decomposed; the keyframe's known
-height d and normal n over the ground choose among its four solutions and give t its length. The corners lie where
-their rays met the ground z = 0, and the pose is refined on their reprojection errors. It keeps no map: what it knows
+homography between the keyframe and the frame, H = R + t nᵀ/d, is found by RANSAC and decomposed; the ground's normal n
+and the keyframe's distance d from it choose among its four solutions and give t its length. The first keyframe is
+taken to be level only as long as it stands; its last homography tells how the ground lies. From then on corners lie
+where their rays met the ground, and the pose is refined on their reprojection errors. It keeps no map: what it knows
 of the ground is that it is flat, which is why bumps lead it astray.
+
+World: z up but for the tilt of the first frame.
 """
 
 from __future__ import annotations
@@ -56,12 +59,23 @@ class Pose(NamedTuple):
     place: Floats
 
 
+class Plane(NamedTuple):
+    """The ground: normal [3] in the world, away from the camera; `known` by a homography, not only taken for level."""
+
+    normal: Floats
+    known: bool
+
+
+LEVEL = Plane(np.array([0.0, 0.0, -1.0]), known=False)
+
+
 @dataclass(frozen=True, slots=True)
 class Keyframe:
-    """The last keyframe: its frame number, pose, and how many corners it had."""
+    """The last keyframe: its frame number, pose, distance from the ground (m), and how many corners it had."""
 
     frame: int
     pose: Pose
+    distance_m: float
     corners: int
 
 
@@ -78,6 +92,7 @@ class State:
     image: Grey = field(repr=False)
     pose: Pose
     keyframe: Keyframe
+    plane: Plane
     first_unit: Floats
     ground_m: Floats
     px: NDArray[np.float32]
@@ -115,7 +130,7 @@ class KltOdometry:
             return state, _skipped(state, sample, Verdict.OUT_OF_ORDER)
         image = np.asarray(sample.grey(), np.uint8)
         if state is None:
-            begun = self._keyframe(image, sample, self._start_pose(), 0)
+            begun = self._keyframe(image, sample, self._start_pose(), LEVEL, self._height_m, 0)
             return begun, _step(begun, None, sample, Stage.STARTED, Verdict.FIRST_FRAME)
         if image.shape != state.image.shape:
             return state, _skipped(state, sample, Verdict.SIZE_CHANGED)
@@ -127,16 +142,18 @@ class KltOdometry:
         px, found = self._flow(state, image)
         unit = self._unit(image, px[found])
         first, ground = state.first_unit[found], state.ground_m[found]
-        pose, inliers = self._pose(state.keyframe.pose, first, unit, ground)
-        if pose is None:
-            begun = self._keyframe(image, sample, state.pose, state.starts + 1)
+        found_pose = self._pose(state, first, unit, ground)
+        if found_pose is None:
+            begun = self._keyframe(image, sample, state.pose, state.plane, _distance(state.keyframe, state.plane, state.pose), state.starts + 1)
             return begun, _step(begun, state, sample, Stage.LOST, Verdict.LOST)
+        pose, plane, inliers = found_pose
         after = State(
-            sample.frame, sample.t_ns, image, pose, state.keyframe, first[inliers], ground[inliers],
+            sample.frame, sample.t_ns, image, pose, state.keyframe, state.plane, first[inliers], ground[inliers],
             px[found][inliers], state.starts,
         )  # fmt: skip
         if len(after.px) < self.settings.keyframe_share * state.keyframe.corners:
-            after = self._keyframe(image, sample, pose, state.starts)
+            distance = _distance(state.keyframe, plane, pose)
+            after = self._keyframe(image, sample, pose, plane, distance, state.starts)
         return after, _step(after, state, sample, Stage.TRACKED, Verdict.OK, int(np.count_nonzero(inliers)))
 
     def _flow(self, state: State, image: Grey) -> tuple[NDArray[np.float32], NDArray[np.bool_]]:
@@ -151,32 +168,39 @@ class KltOdometry:
         inside = (px >= 0).all(axis=1) & (px[:, 0] <= width - 1) & (px[:, 1] <= height - 1)
         return px, (status.ravel() == 1) & inside
 
-    def _pose(self, key: Pose, first: Floats, unit: Floats, ground: Floats) -> tuple[Pose | None, NDArray[np.bool_]]:
-        """The pose from corners at unit depth in the keyframe and now [n, 2], and which agree with it."""
-        none = np.zeros(len(unit), np.bool_)
+    def _pose(
+        self, state: State, first: Floats, unit: Floats, ground: Floats
+    ) -> tuple[Pose, Plane, NDArray[np.bool_]] | None:
+        """The pose from corners at unit depth in the keyframe and now [n, 2], the ground, and which agree with it."""
         if len(unit) < self.settings.min_tracked:
-            return None, none
+            return None
         assert self.settings.focal_px is not None
         cv2.setRNGSeed(RANSAC_SEED)
         bound = self.settings.inlier_px / self.settings.focal_px
         homography, mask = cv2.findHomography(
             first, unit, cv2.RANSAC, bound, maxIters=RANSAC_ITERATIONS, confidence=RANSAC_CONFIDENCE
         )
-        inliers = none if homography is None else mask.ravel() > 0
-        if np.count_nonzero(inliers) < self.settings.min_tracked:
-            return None, none
-        return _refined(decomposed(homography, key), ground[inliers], unit[inliers]), inliers
+        if homography is None or np.count_nonzero(mask) < self.settings.min_tracked:
+            return None
+        inliers = mask.ravel() > 0
+        pose, normal = decomposed(homography, state.keyframe, state.plane.normal)
+        if not state.plane.known:
+            return pose, Plane(normal, known=True), inliers
+        return _refined(pose, ground[inliers], unit[inliers]), state.plane, inliers
 
-    def _keyframe(self, image: Grey, sample: ImageSample, pose: Pose, starts: int) -> State:
+    def _keyframe(
+        self, image: Grey, sample: ImageSample, pose: Pose, plane: Plane, distance_m: float, starts: int
+    ) -> State:
         s = self.settings
         corners: Any = cv2.goodFeaturesToTrack(image, s.corners, s.corner_quality, s.corner_distance_px)
         px = np.empty((0, 2), np.float32) if corners is None else corners.reshape(-1, 2)
         unit = self._unit(image, px)
         ways = np.column_stack([unit, np.ones(len(unit))]) @ pose.turn.T
-        down = ways[:, 2] < 0
-        ground = pose.place - pose.place[2] / ways[down, 2:] * ways[down]
-        key = Keyframe(sample.frame, pose, int(np.count_nonzero(down)))
-        return State(sample.frame, sample.t_ns, image, pose, key, unit[down], ground, px[down], starts)
+        nears = ways @ plane.normal
+        down = nears > 0
+        ground = pose.place + distance_m / nears[down, None] * ways[down]
+        key = Keyframe(sample.frame, pose, distance_m, int(np.count_nonzero(down)))
+        return State(sample.frame, sample.t_ns, image, pose, key, plane, unit[down], ground, px[down], starts)
 
     # ------------------------------------------------------------------------------ camera
 
@@ -196,16 +220,21 @@ class KltOdometry:
 # ------------------------------------------------------------------------------- geometry
 
 
-def decomposed(homography: Floats, key: Pose) -> Pose:
-    """The camera's pose from a homography of the ground z = 0, between rays of a keyframe and of the camera.
+def decomposed(homography: Floats, key: Keyframe, normal: Floats) -> tuple[Pose, Floats]:
+    """The camera's pose and the ground's normal [3] in the world from a homography of the ground.
 
-    H = R + t nᵀ/d maps the keyframe's; of OpenCV's solutions that whose normal is nearest to the ground's.
+    H = R + t nᵀ/d maps the keyframe's rays; of OpenCV's solutions that whose normal is nearest to the one given.
     """
-    normal = -key.turn[2]
     _, turns, shifts, normals = cv2.decomposeHomographyMat(homography, np.eye(3))
-    best = int(np.argmax([float(n.ravel() @ normal) for n in normals]))
-    turn = key.turn @ turns[best].T
-    return Pose(turn, key.place - turn @ shifts[best].ravel() * key.place[2])
+    in_world = [key.pose.turn @ n.ravel() for n in normals]
+    best = int(np.argmax([float(n @ normal) for n in in_world]))
+    turn = key.pose.turn @ turns[best].T
+    return Pose(turn, key.pose.place - turn @ shifts[best].ravel() * key.distance_m), in_world[best]
+
+
+def _distance(key: Keyframe, plane: Plane, pose: Pose) -> float:
+    """Distance of a camera from the ground, which the keyframe's is known from."""
+    return key.distance_m - float(plane.normal @ (pose.place - key.pose.place))
 
 
 def _refined(pose: Pose, ground: Floats, unit: Floats) -> Pose:
