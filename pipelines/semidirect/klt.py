@@ -144,7 +144,14 @@ class KltOdometry:
         first, ground = state.first_unit[found], state.ground_m[found]
         found_pose = self._pose(state, first, unit, ground)
         if found_pose is None:
-            begun = self._keyframe(image, sample, state.pose, state.plane, _distance(state.keyframe, state.plane, state.pose), state.starts + 1)
+            begun = self._keyframe(
+                image,
+                sample,
+                state.pose,
+                state.plane,
+                _distance(state.keyframe, state.plane, state.pose),
+                state.starts + 1,
+            )
             return begun, _step(begun, state, sample, Stage.LOST, Verdict.LOST)
         pose, plane, inliers = found_pose
         after = State(

@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -75,9 +75,9 @@ class Accuracy:
         lost_frames: frames after the first pose that it does not stand by.
         relocalisations: how often it found itself again in its map.
         maps: maps that it began.
-        longest_unnoticed: most frames in a row that it stands by though its motion is wrong.
         path_m: true length of the whole flight.
         covered: share of the path along which it stands by its poses.
+        longest_unnoticed: most frames in a row that it stands by though its motion is wrong.
         ate_m: rmse of the positions after Sim(3), m.
         ate_share: that by the length of the flight.
         worst_share: largest error, by the length of the flight.
@@ -99,20 +99,20 @@ class Accuracy:
     lost_frames: int
     relocalisations: int
     maps: int
-    longest_unnoticed: int
     path_m: float
     covered: float
-    ate_m: float
-    ate_share: float
-    worst_share: float
-    attitude_rad: float
-    attitude_worst_rad: float
-    rpe_mps: float
-    rpe_median_mps: float
-    rpe_radps: float
-    rpe_median_radps: float
-    scale: float
-    scale_drift: float
+    longest_unnoticed: int = 0
+    ate_m: float = math.nan
+    ate_share: float = math.nan
+    worst_share: float = math.nan
+    attitude_rad: float = math.nan
+    attitude_worst_rad: float = math.nan
+    rpe_mps: float = math.nan
+    rpe_median_mps: float = math.nan
+    rpe_radps: float = math.nan
+    rpe_median_radps: float = math.nan
+    scale: float = math.nan
+    scale_drift: float = math.nan
     note: str = ""
 
 
@@ -224,37 +224,21 @@ def scored(track: Track, truth: SpatialPath) -> tuple[Accuracy, Curves, SpatialA
         raise ValueError(f"{len(track.t_ns)} steps for {len(truth)} true poses: each frame needs both")
     rows, along = track.claimed(), path_lengths(truth)
     fit, note = _fit(track, truth, rows)
-    kept = truth.at(rows)
-    counts = {
-        "frames": len(truth),
-        "accepted": len(rows),
-        "first": int(rows[0]) if len(rows) else -1,
-        "losses": losses(track.accepted, track.stage),
-        "lost_frames": len(truth) - int(rows[0]) - len(rows) if len(rows) else 0,
-        "relocalisations": int(np.count_nonzero(track.stage == Stage.RELOCALISED)),
-        "maps": len(np.unique(track.map_number[rows])),
-    }
-    length = float(along[-1])
-    covered = float(np.diff(along)[track.accepted[1:] & track.accepted[:-1]].sum()) / length if length else math.nan
+    accuracy, curves = _unknown(track, along, note), Curves(*(np.empty(0),) * 5)
     if fit is None:
-        unknown = dict.fromkeys(_MEASURED, math.nan)
-        scores = Accuracy(**counts, longest_unnoticed=0, path_m=length, covered=covered, note=note, **unknown)
-        return scores, Curves(*(np.empty(0),) * 5), None
-    raw = SpatialPath(track.t_ns[rows], track.position_m[rows], track.quat_xyzw[rows])
+        return accuracy, curves, None
+    kept, raw = truth.at(rows), SpatialPath(track.t_ns[rows], track.position_m[rows], track.quat_xyzw[rows])
     aligned = fit(raw)
     absolute = absolute_error(aligned, kept)
-    seconds = 1e-9 * (raw.t_ns - raw.t_ns[0])
-    relative = relative_error(aligned, kept, pairs_by_measure(seconds, RPE_S, tolerance=0.02))
+    relative = relative_error(aligned, kept, pairs_by_measure(1e-9 * (raw.t_ns - raw.t_ns[0]), RPE_S, tolerance=0.02))
     places, ratio = local_scale(aligned, kept)
     places = places + along[rows[0]]
-    accuracy = Accuracy(
-        **counts,
+    accuracy = replace(
+        accuracy,
         longest_unnoticed=longest_unnoticed(rows, aligned, kept),
-        path_m=length,
-        covered=covered,
         ate_m=absolute.translation.rmse,
-        ate_share=absolute.translation.rmse / length,
-        worst_share=absolute.translation.max / length,
+        ate_share=absolute.translation.rmse / accuracy.path_m,
+        worst_share=absolute.translation.max / accuracy.path_m,
         attitude_rad=absolute.rotation.rmse,
         attitude_worst_rad=absolute.rotation.max,
         rpe_mps=relative.translation.rmse / RPE_S,
@@ -262,17 +246,28 @@ def scored(track: Track, truth: SpatialPath) -> tuple[Accuracy, Curves, SpatialA
         rpe_radps=relative.rotation.rmse / RPE_S,
         rpe_median_radps=relative.rotation.median / RPE_S,
         scale=fit.scale,
-        scale_drift=scale_drift(places, ratio, covered * length),
+        scale_drift=scale_drift(places, ratio, accuracy.covered * accuracy.path_m),
     )
     middle = float(np.median(ratio)) if len(ratio) else 1.0
-    curves = Curves(along[rows], absolute.translation_m, absolute.rotation_rad, places, ratio / middle)
-    return accuracy, curves, fit
+    return accuracy, Curves(along[rows], absolute.translation_m, absolute.rotation_rad, places, ratio / middle), fit
 
 
-_MEASURED = (
-    "ate_m", "ate_share", "worst_share", "attitude_rad", "attitude_worst_rad", "rpe_mps", "rpe_median_mps",
-    "rpe_radps", "rpe_median_radps", "scale", "scale_drift",
-)  # fmt: skip
+def _unknown(track: Track, along: Floats, note: str) -> Accuracy:
+    """The counts of a flight, whose errors are not known; `along` [n] is the true path."""
+    rows, length = track.claimed(), float(along[-1])
+    stood_by = float(np.diff(along)[track.accepted[1:] & track.accepted[:-1]].sum())
+    return Accuracy(
+        frames=len(along),
+        accepted=len(rows),
+        first=int(rows[0]) if len(rows) else -1,
+        losses=losses(track.accepted, track.stage),
+        lost_frames=len(along) - int(rows[0]) - len(rows) if len(rows) else 0,
+        relocalisations=int(np.count_nonzero(track.stage == Stage.RELOCALISED)),
+        maps=len(np.unique(track.map_number[rows])),
+        path_m=length,
+        covered=stood_by / length if length > 0 else math.nan,
+        note=note,
+    )
 
 
 def _fit(track: Track, truth: SpatialPath, rows: NDArray[np.int64]) -> tuple[SpatialAlignment | None, str]:

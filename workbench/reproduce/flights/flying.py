@@ -21,7 +21,7 @@ from pipelines.semidirect.step import VisualStep
 from pipelines.simulation.mission import IMAGE, SimulatedMission
 from pipelines.simulation.scenario import height_of
 from pipelines.simulation.sensors import level_ground
-from pipelines.spatial import SpatialPath
+from pipelines.spatial import SpatialPath, path_lengths
 from readers.streams import Camera, ImageSample, Sample
 from workbench import scenarios
 from workbench.reproduce.flights.methods import Values, built
@@ -129,7 +129,7 @@ def flown(tick: Tick, *, flight: Flight) -> Flown:
         about=loaded.scenario.about,
         frames=len(truth),
         seconds=1e-9 * float(truth.t_ns[-1] - truth.t_ns[0]),
-        path_m=float(scoring.path_lengths(truth)[-1]),
+        path_m=float(path_lengths(truth)[-1]),
         height_m=height,
         results=tuple(pilot.result(method, truth, height) for method, pilot in crew.items()),
     )
