@@ -96,9 +96,12 @@ class Flight:
     @property
     def identity(self) -> str:
         """All that the result depends on, as text."""
-        settings = {method: settings_values(built(method, {"height_m": 1.0}).settings) for method in self.methods}
-        scenario = self.load().scenario.model_dump(mode="json")
-        return json.dumps({"scenario": scenario, "settings": settings, "versions": versions()}, sort_keys=True)
+        scenario = self.load().scenario
+        assert scenario.camera is not None
+        camera: Values = {"focal_px": scenario.camera.focal_px, "height_m": scenario.camera.height_m}
+        settings = {method: settings_values(built(method, camera).settings) for method in self.methods}
+        depends = {"scenario": scenario.model_dump(mode="json"), "settings": settings, "versions": versions()}
+        return json.dumps(depends, sort_keys=True)
 
 
 def flown(tick: Tick, *, flight: Flight) -> Flown:
