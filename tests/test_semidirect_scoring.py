@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 from scipy.spatial.transform import Rotation
+from visual_steps import visual_step
 
 from pipelines.geometry import Floats
 from pipelines.semidirect import scoring
@@ -14,7 +15,6 @@ from pipelines.semidirect.scoring import MapNotes, Track, Work, scored
 from pipelines.semidirect.step import Stage, VisualStep
 from pipelines.simulation.sensors import level_ground
 from pipelines.spatial import SpatialPath, path_lengths
-from visual_steps import visual_step
 
 HEIGHT_M, N = 1.5, 600
 NADIR = np.diag([1.0, -1.0, -1.0])
@@ -229,7 +229,7 @@ def test_a_point_counts_once_at_its_last_place_and_each_map_by_itself() -> None:
     truth, k = flight(), 300
     points, turn = seen_from(truth, k, level_ground, 20, 3), truth.rotation[k].as_matrix()
     notes = MapNotes(level_ground, (0.9, 0.6))
-    notes.add(step_of(truth, k, points + [0, 0, 0.5], map_number=0), turn, turn, truth.position_m[k])
+    notes.add(step_of(truth, k, points + np.array([0, 0, 0.5]), map_number=0), turn, turn, truth.position_m[k])
     notes.add(step_of(truth, k, points[:15], map_number=0), turn, turn, truth.position_m[k])
     notes.add(step_of(truth, k, points, map_number=1), turn, turn, truth.position_m[k])
     _, _, fit = scored(track(truth), truth)

@@ -182,14 +182,19 @@ class Pilot:
             method=method,
             accuracy=accuracy,
             map_errors=self._map.errors(fit, height_m),
-            work=self.work,
+            work=Work.of(self.cpu_ms, self.stage_ms),
             **{name: _thinned(values) for name, values in _curves(curves)},
         )
 
     @property
-    def work(self) -> Work:
-        """CPU time of its frames."""
-        return Work.of(np.array(self._cpu_ms), np.array(self._stage_ms).reshape(len(self._cpu_ms), -1))
+    def cpu_ms(self) -> Floats:
+        """CPU time of each frame's step, ms [n]."""
+        return np.array(self._cpu_ms)
+
+    @property
+    def stage_ms(self) -> Floats:
+        """Time of the stages of each frame, ms [n, k]; k is 0 for a method that does not tell them."""
+        return np.array(self._stage_ms).reshape(len(self._cpu_ms), -1)
 
 
 def _curves(curves: Curves) -> Iterator[tuple[str, Floats]]:
