@@ -30,7 +30,7 @@ from workbench.reproduce.flights.methods import ACCURATE, BASELINE, FAST, KLT, M
 
 Floats = NDArray[np.float64]
 
-SEMIDIRECT_STAGES = ("pyramid", "alignment", "features", "refinement", "mapping")
+SEMIDIRECT_STAGES = ("pyramid", "alignment", "features and pose", "start, relocalisation", "mapping")
 STAGES = {FAST: SEMIDIRECT_STAGES, ACCURATE: SEMIDIRECT_STAGES, BASELINE: BASELINE_STAGES, KLT: ()}
 WARM_UP = 90
 QUICK = {"frames": 150, "passes": 1}
@@ -53,8 +53,7 @@ class Row:
         self.tracking_ms: Floats = np.min([tracking_ms(p.cpu_ms, p.stage_ms) for p in passes], axis=0)
         self.mapping_mean_ms = max(float(np.mean(whole - self.tracking_ms)), 0.0)
         stages = np.min([pilot.stage_ms for pilot in passes], axis=0)
-        told = np.isfinite(stages).all(axis=1)
-        self.stages = np.median(stages[told], axis=0) if np.any(told) else np.empty(0)
+        self.stages = np.array([np.median(ms[np.isfinite(ms)]) if np.isfinite(ms).any() else np.nan for ms in stages.T])
         self.accuracy: Accuracy = scored(passes[0].track, truth)[0]
 
     @property
@@ -73,10 +72,10 @@ def print_rows(rows: Sequence[Row]) -> None:
         times = f"{row.median_ms:12.2f}{np.percentile(row.tracking_ms, 95):8.2f}{1e3 / row.median_ms:10.0f}"
         errors = f"{100 * a.ate_share:9.4f}{100 * a.scale_drift:+9.2f}{a.lost_frames:6d}"
         print(f"{row.method:10}{times}{row.mapping_mean_ms:12.2f}{errors}")
-    print("\nstages, ms of the median frame:")
+    print("\nstages, CPU ms of the median frame that has them:")
     for row in rows:
-        named = zip(STAGES[row.method], row.stages.tolist(), strict=False)
-        print(f"{row.method:10}" + (", ".join(f"{name} {ms:.2f}" for name, ms in named) or "not told"))
+        named = zip(STAGES[row.method], row.stages.tolist(), strict=True)
+        print(f"{row.method:10}" + (", ".join(f"{name} {ms:.2f}" for name, ms in named) or "all in one"))
     print("\nframe rate of the tracking, times the peer's:")
     peers = [row for row in rows if row.method in (BASELINE, KLT)]
     for row in rows:

@@ -262,8 +262,8 @@ def test_a_map_without_a_path_is_all_outliers_and_no_map_has_no_share() -> None:
 # ------------------------------------------------------------------------------------ work
 
 
-def test_the_mapping_is_taken_off_by_its_share_of_the_stages() -> None:
-    cpu, stages = np.array([10.0, 8.0, 6.0]), np.array([[1.0, 2.0, 1.0], [2.0, 2.0, math.nan], [math.nan] * 3])
+def test_the_mapping_is_no_work_of_the_tracking() -> None:
+    cpu, stages = np.array([10.0, 8.0, 6.0]), np.array([[1.0, 2.0, 2.5], [2.0, 2.0, math.nan], [math.nan] * 3])
     np.testing.assert_allclose(scoring.tracking_ms(cpu, stages), [7.5, 8.0, 6.0])
     np.testing.assert_allclose(scoring.tracking_ms(cpu, np.empty((3, 0))), cpu)
     work = Work.of(cpu, stages)

@@ -374,15 +374,14 @@ def _known(kept: dict[int, Floats], width: int) -> Floats:
 
 
 def tracking_ms(cpu_ms: Floats, stage_ms: Floats) -> Floats:
-    """CPU time [n] of the tracking of each frame: that of the whole step, less the mapping's share of its stages.
+    """CPU time [n] of the tracking of each frame: that of the whole step, less the mapping's.
 
     Args:
         cpu_ms: CPU time of the step's thread [n].
-        stage_ms: time of its stages [n, k], the last of which is the mapping; NaN or [n, 0] where it has none.
+        stage_ms: that of its stages [n, k], the last of which is the mapping; NaN where there was none, [n, 0] for a
+            method that does not tell them.
     """
-    total = np.nansum(stage_ms, axis=1)
-    mapping = np.nan_to_num(stage_ms[:, -1]) if stage_ms.shape[1] else np.zeros(len(cpu_ms))
-    return np.asarray(cpu_ms * (1 - np.divide(mapping, total, out=np.zeros(len(cpu_ms)), where=total > 0)))
+    return cpu_ms - np.nan_to_num(stage_ms[:, -1]) if stage_ms.shape[1] else cpu_ms
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
