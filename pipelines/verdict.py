@@ -112,7 +112,7 @@ _SENTENCES: dict[Verdict, str] = {
     Verdict.OUT_OF_ORDER: "the frame's stamp does not lie after the one before it; the frame was skipped",
     Verdict.SIZE_CHANGED: "the image size differs from that of the frame before",
     Verdict.UNDECODABLE: "the image could not be decoded",
-    Verdict.LOST: "no position: the last velocity is held until the global search succeeds",
+    Verdict.LOST: "no position: what was last known is held until it is found again",
     Verdict.LANDMARK_REJECTED: "an image point lies outside the gate of its landmark and was not used",
     Verdict.LANDMARK_RESET: "a landmark's image points were rejected several times in a row: its range starts again",
     Verdict.LANDMARK_LOST: "a landmark was given up: it was not seen for long, or came behind the camera",

@@ -350,7 +350,7 @@ class SemidirectOdometry:
             motion=None,
             motion_s=math.nan,
             held=world.keyframes.cam_t_world[-1],
-            tracked=len(world.points.number),
+            tracked=sighted.points,
             lost_ns=-1,
             map_number=state.map_number + 1,
             relocalised_frames=0 if again else -1,

@@ -1,13 +1,13 @@
 """A lost camera found again by a keyframe: small blurred images laid over one another, then tracking from there.
 
-The small images are the coarsest level of the pyramids. Their rigid motion (G. D. Evangelidis, E. Z. Psarakis, IEEE
-PAMI 30(10), 2008, OpenCV's ECC) carries the keyframe's points to where they should be in the frame; the pose that
-fits these best is the start of sparse and feature alignment, which have the last word.
+The small images are the coarsest level of the pyramids that is large enough. Their rigid motion (G. D. Evangelidis,
+E. Z. Psarakis, IEEE PAMI 30(10), 2008, OpenCV's ECC) carries the keyframe's points to where they should be in the
+frame; the pose that fits these best is the start of sparse and feature alignment, which have the last word.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
@@ -22,10 +22,14 @@ from pipelines.semidirect.tracking import Known, Tracked, Tracker
 
 Floats = NDArray[np.float64]
 
-SMALL = LEVELS - 1
-BLUR_PX = 1.5
-ITERATIONS = 50
-PRECISION = 1e-4
+LEAST_SIDE_PX = 30
+BLUR_PX = 1.0
+LEAST_OVERLAP = 0.3
+"""Share of the small image that both must show."""
+LEAST_CONTRAST = 1.0
+"""Standard deviation of a small image, grey levels, below which there is nothing to lay over one another."""
+ITERATIONS = 100
+PRECISION = 1e-6
 TRIED = 3
 """Keyframes that are tried for a frame, the nearest first."""
 
@@ -63,7 +67,8 @@ def _worth(found: Relocalised) -> tuple[int, float]:
 def _by_keyframe(tracker: Tracker, world: LocalMap, row: int, frame: Pyramid, least_correlation: float) -> Relocalised:
     number = int(world.keyframes.number[row])
     pyramid = pyramid_in(world, row, frame)
-    motion, correlation = small_motion(level_image(pyramid, SMALL), level_image(frame, SMALL))
+    small = small_level(frame)
+    motion, correlation = small_motion(level_image(pyramid, small), level_image(frame, small))
     if not correlation >= least_correlation:
         return Relocalised(number, correlation, None)
     owner, at = owners(world.seen), world.seen.frame == row
@@ -71,9 +76,9 @@ def _by_keyframe(tracker: Tracker, world: LocalMap, row: int, frame: Pyramid, le
     if len(rows) < MIN_PATCHES:
         return Relocalised(number, correlation, None)
     places = world.points.place[rows]
-    expected = moved_pixels(motion, pixels)
+    expected = moved_pixels(motion, pixels, small)
     key_t_world = world.keyframes.cam_t_world[row]
-    level = np.full(len(rows), SMALL)
+    level = np.full(len(rows), small)
     posed = refinement.refine_pose(
         tracker.optics, places, expected, level, key_t_world, refinement.PoseOptions(inlier_px=np.inf)
     )
@@ -82,21 +87,51 @@ def _by_keyframe(tracker: Tracker, world: LocalMap, row: int, frame: Pyramid, le
     return Relocalised(number, correlation, tracker.track(world, key, frame, prior))
 
 
+def small_level(frame: Pyramid) -> int:
+    """The coarsest level whose sides are long enough; the finest where none is."""
+    side = min(frame.height, frame.width)
+    return max((level for level in range(LEVELS) if side >> level >= LEAST_SIDE_PX), default=0)
+
+
 def small_motion(reference: Grey, current: Grey) -> tuple[Floats, float]:
     """The rigid motion [2, 3] of pixels of one small image to the other, and the correlation then; NaN for none."""
     one, two = (cv2.GaussianBlur(image.astype(np.float32), (0, 0), BLUR_PX) for image in (reference, current))
-    shift, _ = cv2.phaseCorrelate(one, two, cv2.createHanningWindow(one.shape[::-1], cv2.CV_32F))
-    motion = np.array([[1, 0, shift[0]], [0, 1, shift[1]]], np.float32)
+    if min(one.std(), two.std()) < LEAST_CONTRAST:
+        return np.full((2, 3), np.nan), np.nan
+    motion = _shift(one, two)
     stop = (cv2.TERM_CRITERIA_EPS | cv2.TERM_CRITERIA_COUNT, ITERATIONS, PRECISION)
     try:
-        correlation, motion = cv2.findTransformECC(one, two, motion, cv2.MOTION_EUCLIDEAN, stop)
+        _, motion = cv2.findTransformECC(one, two, motion, cv2.MOTION_EUCLIDEAN, stop)
     except cv2.error:  # how OpenCV says that the iteration did not converge
         return np.full((2, 3), np.nan), np.nan
-    return np.asarray(motion, np.float64), float(correlation)
+    return np.asarray(motion, np.float64), overlap_correlation(one, two, motion)
 
 
-def moved_pixels(motion: Floats, pixels: Floats) -> Floats:
-    """Pixels [n, 2] of level 0 through a motion [2, 3] of the small images."""
-    size = float(1 << SMALL)
+def _shift(reference: NDArray[np.float32], current: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Where the middle of one image correlates best with the other, as a motion [2, 3] without rotation."""
+    rows, columns = reference.shape
+    top, left = rows // 4, columns // 4
+    middle = reference[top : rows - top, left : columns - left]
+    _, _, _, (u, v) = cv2.minMaxLoc(cv2.matchTemplate(current, middle, cv2.TM_CCOEFF_NORMED))
+    return np.array([[1, 0, u - left], [0, 1, v - top]], np.float32)
+
+
+def overlap_correlation(reference: NDArray[np.float32], current: NDArray[np.float32], motion: Any) -> float:
+    """Correlation of what two images both show once one is moved [2, 3] over the other; NaN for too little."""
+    size = reference.shape[::-1]
+    flags = cv2.INTER_LINEAR | cv2.WARP_INVERSE_MAP
+    there = cv2.warpAffine(np.ones_like(current), motion, size, flags=flags) > 0.99
+    if np.count_nonzero(there) < LEAST_OVERLAP * there.size:
+        return float("nan")
+    a, b = reference[there], cv2.warpAffine(current, motion, size, flags=flags)[there]
+    a, b = a - a.mean(), b - b.mean()
+    if min(a.std(), b.std()) < LEAST_CONTRAST:
+        return float("nan")
+    return float((a @ b) / np.sqrt((a @ a) * (b @ b)))
+
+
+def moved_pixels(motion: Floats, pixels: Floats, level: int) -> Floats:
+    """Pixels [n, 2] of level 0 through a motion [2, 3] of images of a level."""
+    size = float(1 << level)
     small = (pixels + 0.5) / size - 0.5
     return np.asarray((small @ motion[:, :2].T + motion[:, 2] + 0.5) * size - 0.5)
