@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from typing import Any, ClassVar, NamedTuple, TypeVar
 
@@ -26,7 +26,8 @@ from pipelines.correlation.odometry import eight_bit
 from pipelines.estimator import EstimatorError, FrameImage, Images
 from pipelines.geometry import se3_exp, se3_inverse, se3_log, se3_product, so3_exp, wrap_angle
 from pipelines.semidirect import baseline_map, epipolar, scale
-from pipelines.semidirect.baseline_map import Adjusted, Growth, Map, Seen
+from pipelines.semidirect.baseline_map import Growth, Map, Seen
+from pipelines.semidirect.baseline_records import Notes, Tracked, nothing, of_bundles, of_map, of_tracking
 from pipelines.semidirect.baseline_search import (
     Matches,
     SearchOptions,
@@ -38,13 +39,13 @@ from pipelines.semidirect.baseline_search import (
     view_of,
 )
 from pipelines.semidirect.baseline_settings import BaselineSettings
-from pipelines.semidirect.baseline_step import STAGES, BaselineStep
+from pipelines.semidirect.baseline_step import BaselineStep
 from pipelines.semidirect.features import FeatureOptions
 from pipelines.semidirect.optics import Optics, optics_of, rays
 from pipelines.semidirect.pyramid import Grey, level_image
 from pipelines.semidirect.refinement import BundleOptions, PoseOptions, RefinedPose, refine_pose
 from pipelines.semidirect.start import Start, StartLimits, StartOutcome, start
-from pipelines.semidirect.step import Feature, Stage
+from pipelines.semidirect.step import Stage
 from pipelines.verdict import Verdict, gravest
 from readers.streams import ImageError, ImageSample, Problem, Sample, StreamKind
 
@@ -52,8 +53,6 @@ Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 T = TypeVar("T")
-Notes = dict[str, Any]
-"""Fields of the frame's Step, by name."""
 
 INTERVALS = 15
 """Frames whose intervals make the running median."""
@@ -75,6 +74,10 @@ class Trail(NamedTuple):
     now_px: Floats
     level: Longs
 
+    def chosen(self, which: Flags) -> Trail:
+        """Some of the corners."""
+        return self._replace(first_px=self.first_px[which], now_px=self.now_px[which], level=self.level[which])
+
 
 class Unit(NamedTuple):
     """The scale: whether lengths are metres, metres of a unit of the first map and their standard deviation."""
@@ -84,41 +87,13 @@ class Unit(NamedTuple):
     sigma: float
 
 
-class Tracked(NamedTuple):
-    """What tracking made of a frame.
-
-    `prior` and `coarse` are poses [4, 4] before and after the coarse step; `rows` [M] the points of the fine step with
-    their `match`, errors and whether they agree with the `pose`, which is None where too few were matched.
-    """
-
-    prior: Floats
-    coarse: Floats
-    coarse_tried: int
-    coarse_found: int
-    rows: Longs
-    match: Matches
-    pose: RefinedPose | None
-    error_px: Floats
-    inlier: Flags
-
-    @property
-    def agreeing(self) -> int:
-        """Points that agree with the pose."""
-        return int(np.count_nonzero(self.inlier))
-
-    @property
-    def share(self) -> float:
-        """Their share of the points that were looked for."""
-        return self.agreeing / max(len(self.rows), 1)
-
-
 @dataclass(frozen=True, slots=True)
 class BaselineState:
     """All that the baseline carries from frame to frame.
 
     `view`, `frame` and `t_ns` are those of the last frame that could be used; `trail` there is while a map is being
-    started. `pose` is the last cam_T_world [4, 4] that was found, at `pose_ns`, and `velocity` [6] the twist per second
-    of the motion to it.
+    started. `pose` is the last cam_T_world [4, 4] that was found, at `pose_ns`; `guess` goes on from there while lost,
+    with the `velocity` [6], a twist per second.
     `since_bundle` counts the keyframes since the last global bundle.
     """
 
@@ -134,6 +109,7 @@ class BaselineState:
     unit: Unit = Unit(False, math.nan, math.nan)
     pose: Floats | None = None
     pose_ns: int = -1
+    guess: Floats | None = None
     velocity: Floats | None = None
     lost_frames: int = 0
     relocalised_frames: int = -1
@@ -194,7 +170,7 @@ class BaselineOdometry:
 
     def packed(self, state: BaselineState) -> BaselineState:
         """The state with the images of its frames by number, see `Resumable`."""
-        return _with_views(state, lambda frame, _: FrameImage(frame), None)
+        return _with_views(state, FrameImage)
 
     def unpacked(self, packed: Any, images: Images) -> BaselineState:
         """The state that was packed, see `Resumable`.
@@ -204,7 +180,7 @@ class BaselineOdometry:
         """
         if not isinstance(packed, BaselineState):
             raise EstimatorError(f"{type(packed).__name__} is no state of the estimator {self.name!r}; replay again")
-        whole = _with_views(packed, lambda frame, _: self._view(eight_bit(images(frame))), None)
+        whole = _with_views(packed, lambda frame: self._view(eight_bit(images(frame))))
         if whole.map is None:
             return whole
         buffers = np.array([view.pyramid.buffer for view in whole.map.views])
@@ -236,7 +212,7 @@ class BaselineOdometry:
             t_ns=sample.t_ns,
             view=view,
             optics=state.optics or self._optics(view),
-            intervals=(*state.intervals[-INTERVALS + 1 :], *([dt_s] if dt_s == dt_s else [])),
+            intervals=() if state.view is None else (*state.intervals[1 - INTERVALS :], dt_s),
             relocalised_frames=state.relocalised_frames + (state.relocalised_frames >= 0),
         )
         notes: Notes = {"corners": len(view.corners.column)}
@@ -244,16 +220,15 @@ class BaselineOdometry:
         if state.intervals and dt_s > self._settings.gap_factor * float(np.median(state.intervals)):
             alarms |= Verdict.FRAME_GAP
         image_ms = lap()
+        tracked = None
         if now.map is None:
             now, stage, found = self._starting(now, notes)
-            track_ms, map_ms = lap(), math.nan
         else:
             now, tracked, stage, found = self._tracking(now, notes)
-            track_ms, map_ms = lap(), math.nan
-            if tracked is not None:
-                now = self._mapping(now, tracked, notes)
-                map_ms = lap()
-        notes["stage_ms"] = np.array([image_ms, track_ms, map_ms])
+        track_ms = lap()
+        if tracked is not None:
+            now = self._mapping(now, tracked, notes)
+        notes["stage_ms"] = np.array([image_ms, track_ms, lap()])
         return now, self._record(state, now, sample, stage, alarms | found, notes)
 
     def _view(self, grey: Grey) -> View:
@@ -291,9 +266,10 @@ class BaselineOdometry:
         limits = StartLimits(
             s.start_min_matches, s.start_motion_px, s.start_parallax_px, s.inlier_px, s.start_min_inliers
         )
-        solved = start(
-            rays(optics, trail.first_px)[:, :2], rays(optics, trail.now_px)[:, :2], optics.focal_u, limits=limits
-        )
+        first, second = rays(optics, trail.first_px)[:, :2], rays(optics, trail.now_px)[:, :2]
+        known = np.all(np.isfinite(first) & np.isfinite(second), axis=1)
+        trail = trail.chosen(known)
+        solved = start(first[known], second[known], optics.focal_u, limits=limits)
         notes |= {
             "start_matches": len(trail.now_px),
             "start_motion_px": solved.motion_px,
@@ -313,7 +289,8 @@ class BaselineOdometry:
         plane = scale.plane_of(solved.points[solved.inlier])
         planar, height, unit = s.start_pose, plane.distance, Unit(False, math.nan, math.nan)
         if now.pose is not None:
-            planar, height = _planar(s, now.pose), float(se3_inverse(now.pose)[2, 3])
+            planar, last = _planar(s, now.pose), float(se3_inverse(now.pose)[2, 3])
+            height = last if last > 0 else height
         elif s.height_m is not None:
             height = s.height_m
             one = (np.array([x]) for x in (height, s.height_sigma_m, plane.distance, plane.sigma))
@@ -337,7 +314,7 @@ class BaselineOdometry:
         m = baseline_map.with_new_points(baseline_map.with_points(m, points, seen), optics, self._growth)
         depth = float(np.median(_depths(pose, points)))
         notes |= {"tracked": len(points), "keyframe": 1, "points_added": len(m.points), "scene_depth_m": depth}
-        notes |= _structure(m, optics, 1.0)
+        notes |= of_map(m, optics, 1.0)
         velocity = se3_log(second_T_first) / ((now.t_ns - trail.t_ns) * 1e-9)
         return replace(
             now,
@@ -346,6 +323,7 @@ class BaselineOdometry:
             map_number=now.map_number + 1,
             unit=unit,
             pose=pose,
+            guess=pose,
             pose_ns=now.t_ns,
             velocity=velocity,
             lost_frames=0,
@@ -357,28 +335,29 @@ class BaselineOdometry:
     def _tracking(self, now: BaselineState, notes: Notes) -> tuple[BaselineState, Tracked | None, Stage, Verdict]:
         """The pose by the motion model and the map; where that fails, by the keyframe that looks alike."""
         s, m, pose = self._settings, _known(now.map), _known(now.pose)
-        seconds = (now.t_ns - now.pose_ns) * 1e-9
-        motion = _known(now.velocity) * s.velocity_decay**now.lost_frames * seconds
-        tracked = self._track(now, se3_product(se3_exp(motion), pose))
+        motion = se3_exp(_known(now.velocity) * now.intervals[-1])
+        now = replace(now, guess=se3_product(motion, _known(now.guess)))
+        tracked = self._track(now, _known(now.guess))
         stage, alarms = Stage.TRACKED, Verdict.OK
         if not self._holds(tracked, s.good_share if now.lost_frames else s.lost_share):
             found = self._relocalised(now, notes)
             if found is None:
-                notes |= _track_notes(m, tracked)
+                notes |= of_tracking(m, tracked) | {"pose_sigma": np.full(6, math.nan)}
                 return self._lost(now), None, Stage.LOST, Verdict.LOST
             tracked, stage, alarms = found, Stage.RELOCALISED, Verdict.REACQUIRED
         refined = _known(tracked.pose)
-        velocity = se3_log(se3_product(refined.cam_t_world, se3_inverse(pose))) / seconds
+        moved = se3_log(se3_product(refined.cam_t_world, se3_inverse(pose)))
         now = replace(
             now,
             map=_counted(m, tracked),
             pose=refined.cam_t_world,
             pose_ns=now.t_ns,
-            velocity=np.zeros(6) if stage is Stage.RELOCALISED else velocity,
+            guess=refined.cam_t_world,
+            velocity=np.zeros(6) if stage is Stage.RELOCALISED else moved / ((now.t_ns - now.pose_ns) * 1e-9),
             lost_frames=0,
             relocalised_frames=0 if stage is Stage.RELOCALISED else now.relocalised_frames,
         )
-        notes |= _track_notes(m, tracked)
+        notes |= of_tracking(m, tracked)
         return now, tracked, stage, alarms
 
     def _track(self, now: BaselineState, prior: Floats) -> Tracked:
@@ -388,32 +367,33 @@ class BaselineOdometry:
         high = seen[m.sources(seen).level >= s.coarse_level]
         rows = _spread(high, s.coarse_points)
         match = self._search(now, prior, rows, self._coarse)
-        matched = match.outcome == Feature.MATCHED
-        coarse, tried, found, fine = prior, len(rows), int(np.count_nonzero(matched)), self._fine
+        coarse, tried, found, fine = prior, len(rows), match.found_count, self._fine
         if found >= s.coarse_min:
-            options = PoseOptions(s.pose_iterations, s.pose_iterations, inlier_px=s.inlier_px)
-            coarse = refine_pose(
-                optics, m.points[rows[matched]], match.found[matched], match.level[matched], prior, options
-            ).cam_t_world
+            coarse = self._refined(now, prior, rows, match, s.pose_iterations).cam_t_world
             seen = baseline_map.visible(m, optics, coarse, view)
         else:
             fine = fine._replace(radius_px=2 * fine.radius_px)
         rows = _spread(seen, s.fine_points)
         match = self._search(now, coarse, rows, fine)
-        matched = match.outcome == Feature.MATCHED
-        error, inlier = np.full(len(rows), np.nan), np.zeros(len(rows), np.bool_)
-        if np.count_nonzero(matched) < s.min_tracked:
-            return Tracked(prior, coarse, tried, found, rows, match, None, error, inlier)
-        options = PoseOptions(s.pose_iterations, s.pose_iterations // 2, inlier_px=s.inlier_px)
-        pose = refine_pose(optics, m.points[rows[matched]], match.found[matched], match.level[matched], coarse, options)
-        error[matched], inlier[matched] = pose.error_px, pose.inlier
-        return Tracked(prior, coarse, tried, found, rows, match, pose if pose.solved else None, error, inlier)
+        pose, error, inlier = None, np.full(len(rows), np.nan), np.zeros(len(rows), np.bool_)
+        if match.found_count >= s.min_tracked:
+            refined = self._refined(now, coarse, rows, match, s.pose_iterations // 2)
+            error[match.matched], inlier[match.matched] = refined.error_px, refined.inlier
+            pose = refined if refined.solved else None
+        return Tracked(prior, coarse, tried, found, rows, match, pose, error, inlier)
 
     def _search(self, now: BaselineState, pose: Floats, rows: Longs, options: SearchOptions) -> Matches:
         m = _known(now.map)
         return find_points(
             _known(now.optics), m.buffers, m.poses, _known(now.view), pose, m.points[rows], m.sources(rows), options
         )
+
+    def _refined(self, now: BaselineState, guess: Floats, rows: Longs, match: Matches, by_errors: int) -> RefinedPose:
+        """The pose of the points that were matched, with so many iterations whose scale follows from the errors."""
+        s, which = self._settings, match.matched
+        options = PoseOptions(s.pose_iterations, by_errors, inlier_px=s.inlier_px)
+        points = _known(now.map).points[rows[which]]
+        return refine_pose(_known(now.optics), points, match.found[which], match.level[which], guess, options)
 
     def _holds(self, tracked: Tracked, least_share: float) -> bool:
         """Whether enough points agree with the pose."""
@@ -424,8 +404,14 @@ class BaselineOdometry:
         """The state after a frame without a pose; a new map is begun when that has lasted."""
         s = self._settings
         forgotten = s.restart_s > 0 and (now.t_ns - now.pose_ns) * 1e-9 > s.restart_s
-        m = _known(now.map)
-        return replace(now, lost_frames=now.lost_frames + 1, map=None if forgotten else m, points_made=m.made)
+        m, velocity = _known(now.map), _known(now.velocity) * s.velocity_decay
+        return replace(
+            now,
+            velocity=velocity,
+            lost_frames=now.lost_frames + 1,
+            map=None if forgotten else m,
+            points_made=m.made,
+        )
 
     def _relocalised(self, now: BaselineState, notes: Notes) -> Tracked | None:
         """Tracking from the keyframe whose small image is most like this one's, turned as it lies best over it."""
@@ -447,41 +433,45 @@ class BaselineOdometry:
 
     def _mapping(self, now: BaselineState, tracked: Tracked, notes: Notes) -> BaselineState:
         """Decide on a keyframe; with one, the map grows and is adjusted."""
-        s, m, optics, pose = self._settings, _known(now.map), _known(now.optics), _known(now.pose)
-        used = tracked.rows[tracked.inlier]
-        depth = float(np.median(_depths(pose, m.points[used])))
-        centre = se3_inverse(pose)[:3, 3]
-        distance = float(np.min(np.linalg.norm(m.centres - centre, axis=1))) / depth
+        s, m, pose = self._settings, _known(now.map), _known(now.pose)
+        depth = float(np.median(_depths(pose, m.points[tracked.rows[tracked.inlier]])))
+        distance = float(np.min(np.linalg.norm(m.centres - se3_inverse(pose)[:3, 3], axis=1))) / depth
         notes |= {"scene_depth_m": depth, "keyframe_distance": distance}
         if distance <= s.keyframe_distance or tracked.share < s.good_share:
             return now
-        before = m.made, len(m.points)
+        return self._with_keyframe(now, tracked, notes)
+
+    def _with_keyframe(self, now: BaselineState, tracked: Tracked, notes: Notes) -> BaselineState:
+        """The state with a keyframe more, new points, and the map adjusted."""
+        s, m, optics, pose = self._settings, _known(now.map), _known(now.optics), _known(now.pose)
+        made, count, used, match = m.made, len(m.points), tracked.inlier, tracked.match
+        newest, centre = np.full(tracked.agreeing, len(m.frames)), se3_inverse(pose)[:3, 3]
         m = baseline_map.with_keyframe(m, now.frame, _known(now.view), pose)
-        newest = np.full(len(used), len(m.frames) - 1)
-        match = tracked.match
-        m = baseline_map.with_seen(m, Seen(used, newest, match.found[tracked.inlier], match.level[tracked.inlier]))
+        m = baseline_map.with_seen(m, Seen(tracked.rows[used], newest, match.found[used], match.level[used]))
         m = baseline_map.without(m, points=(m.outliers > s.point_outliers) & (m.outliers > m.inliers))
         if len(m.frames) > s.max_keyframes:
             m = baseline_map.without(m, keyframe=int(m.nearest(centre)[-1]))
         m = baseline_map.with_new_points(m, optics, self._growth)
-        made = np.flatnonzero(m.ids >= before[0])
-        m = baseline_map.found_again(m, optics, made, m.nearest(centre)[1 : 1 + NEIGHBOURS], self._again)
+        new = np.flatnonzero(m.ids >= made)
+        m = baseline_map.found_again(m, optics, new, m.nearest(centre)[1 : 1 + NEIGHBOURS], self._again)
 
-        options = BundleOptions(s.local_iterations, s.bundle_huber_px, inlier_px=s.inlier_px)
-        local = baseline_map.local_bundle(m, optics, s.local_keyframes, options)
-        adjusted, since = [local], now.since_bundle + 1
+        options, since = (
+            BundleOptions(s.local_iterations, s.bundle_huber_px, inlier_px=s.inlier_px),
+            now.since_bundle + 1,
+        )
+        adjusted = [baseline_map.local_bundle(m, optics, s.local_keyframes, options)]
         if s.global_every and since >= s.global_every:
-            options = options._replace(iterations=s.global_iterations)
-            adjusted, since = [local, baseline_map.global_bundle(local.map, optics, options)], 0
+            options, since = options._replace(iterations=s.global_iterations), 0
+            adjusted.append(baseline_map.global_bundle(adjusted[0].map, optics, options))
         m = adjusted[-1].map
         notes |= {
             "keyframe": 1,
-            "points_added": m.made - before[0],
-            "points_removed": before[1] + m.made - before[0] - len(m.points),
-            **_bundle_notes(adjusted),
-            **_structure(m, optics, _known(tracked.pose).scale_px),
+            "points_added": m.made - made,
+            "points_removed": count + m.made - made - len(m.points),
+            **of_bundles(adjusted),
+            **of_map(m, optics, _known(tracked.pose).scale_px),
         }
-        return replace(now, map=m, pose=m.poses[-1], since_bundle=since)
+        return replace(now, map=m, pose=m.poses[-1], guess=m.poses[-1], since_bundle=since)
 
     # -------------------------------------------------------------------------------- record
 
@@ -502,7 +492,7 @@ class BaselineOdometry:
         moved = np.where(np.isfinite(moved), moved, 0.0)
         size = (math.nan, math.nan) if now.view is None else (now.view.pyramid.width, now.view.pyramid.height)
         values: Notes = {
-            **_nothing(),
+            **nothing(),
             "frame": _frame_of(before, sample),
             "t_ns": sample.t_ns,
             "received_ns": sample.received_ns,
@@ -534,7 +524,7 @@ class BaselineOdometry:
 
 
 def followed(trail: Trail, view: View) -> Trail:
-    """The trail in the next frame: each corner is compared with the first view, from where it was last (Lucas-Kanade)."""
+    """The trail in the next frame: each corner of the first view, sought from where it was last (Lucas-Kanade)."""
     if not len(trail.now_px):
         return trail
     first, image = level_image(trail.view.pyramid, 0), level_image(view.pyramid, 0)
@@ -550,10 +540,7 @@ def followed(trail: Trail, view: View) -> Trail:
     )
     height, width = image.shape
     inside = np.all((there >= 0) & (there <= np.array([width - 1, height - 1])), axis=1)
-    stays = (good.ravel() == 1) & inside
-    return trail._replace(
-        first_px=trail.first_px[stays], now_px=there[stays].astype(np.float64), level=trail.level[stays]
-    )
+    return trail._replace(now_px=there.astype(np.float64)).chosen((good.ravel() == 1) & inside)
 
 
 def levelled(up_in_cam: Floats, heading_rad: float, position_m: Floats) -> Floats:
@@ -601,15 +588,15 @@ def _laps(wanted: bool) -> Callable[[], float]:
     return lap
 
 
-def _with_views(state: BaselineState, change: Callable[[int, Any], Any], buffers: Any) -> BaselineState:
-    """The state with its views changed, which are told their frames."""
+def _with_views(state: BaselineState, made: Callable[[int], Any]) -> BaselineState:
+    """The state with views that are made of the numbers of their frames, and without the keyframes' buffers."""
     m, trail = state.map, state.trail
     if m is not None:
-        views = tuple(change(int(frame), view) for frame, view in zip(m.frames, m.views, strict=True))
-        m = replace(m, views=views, buffers=buffers)
+        none: Any = None
+        m = replace(m, views=tuple(made(frame) for frame in m.frames.tolist()), buffers=none)
     if trail is not None:
-        trail = trail._replace(view=change(trail.frame, trail.view))
-    return replace(state, map=m, trail=trail, view=None if state.view is None else change(state.frame, state.view))
+        trail = trail._replace(view=made(trail.frame))
+    return replace(state, map=m, trail=trail, view=None if state.view is None else made(state.frame))
 
 
 def _spread(rows: Longs, most: int) -> Longs:
@@ -625,9 +612,8 @@ def _depths(pose: Floats, points: Floats) -> Floats:
 def _counted(m: Map, tracked: Tracked) -> Map:
     """The map with each point's count of frames in which it agreed or did not."""
     inliers, outliers = m.inliers.copy(), m.outliers.copy()
-    matched = tracked.match.outcome == Feature.MATCHED
     inliers[tracked.rows[tracked.inlier]] += 1
-    outliers[tracked.rows[matched & ~tracked.inlier]] += 1
+    outliers[tracked.rows[tracked.match.matched & ~tracked.inlier]] += 1
     return replace(m, inliers=inliers, outliers=outliers)
 
 
@@ -650,102 +636,3 @@ def _published(settings: BaselineSettings, pose: Floats | None) -> tuple[Floats,
         return _start_position(settings), np.full(4, math.nan), np.array(settings.start_pose)
     world_T_cam = se3_inverse(pose)
     return world_T_cam[:3, 3], Rotation.from_matrix(world_T_cam[:3, :3]).as_quat(), np.array(_planar(settings, pose))
-
-
-# --------------------------------------------------------------------------------------- notes
-
-
-def _nothing() -> Notes:
-    """The fields of a frame in which nothing was found."""
-    nan, none = math.nan, np.zeros(0, np.int64)
-    return {
-        "pose_sigma": np.full(6, nan),
-        "tracked": 0,
-        "keyframe": 0,
-        "scene_depth_m": nan,
-        "point_id": none,
-        "predicted_px": np.zeros((0, 2)),
-        "found_px": np.zeros((0, 2)),
-        "level": none,
-        "outcome": none,
-        "error_px": np.zeros(0),
-        "score": np.zeros(0),
-        "keyframe_number": none,
-        "keyframe_position_m": np.zeros((0, 3)),
-        "keyframe_quat_xyzw": np.zeros((0, 4)),
-        "map_id": none,
-        "map_point_m": np.zeros((0, 3)),
-        "map_point_sigma_m": np.zeros(0),
-        "map_point_views": none,
-        "prior_position_m": np.full(3, nan),
-        "corners": 0,
-        "coarse_tried": 0,
-        "coarse_found": 0,
-        "coarse_position_m": np.full(3, nan),
-        "pose_scale_px": nan,
-        "keyframe_distance": nan,
-        "points_added": 0,
-        "points_removed": 0,
-        "bundle_keyframes": np.zeros(2, np.int64),
-        "bundle_iterations": np.zeros(2, np.int64),
-        "bundle_cost": np.full((2, 2), nan),
-        "bundle_outliers": np.zeros(2, np.int64),
-        "start_matches": 0,
-        "start_motion_px": nan,
-        "start_parallax_px": nan,
-        "relocalise_keyframe": -1,
-        "relocalise_correlation": nan,
-        "stage_ms": np.full(len(STAGES), nan),
-    }
-
-
-def _track_notes(m: Map, tracked: Tracked) -> Notes:
-    match, pose = tracked.match, tracked.pose
-    outlier = (match.outcome == Feature.MATCHED) & ~tracked.inlier
-    return {
-        "tracked": tracked.agreeing,
-        "pose_sigma": np.full(6, math.nan) if pose is None else np.sqrt(np.diag(pose.covariance)),
-        "pose_scale_px": math.nan if pose is None else pose.scale_px,
-        "point_id": m.ids[tracked.rows],
-        "predicted_px": match.predicted,
-        "found_px": match.found,
-        "level": match.level,
-        "outcome": np.where(outlier, Feature.OUTLIER, match.outcome),
-        "error_px": tracked.error_px,
-        "score": match.score,
-        "prior_position_m": se3_inverse(tracked.prior)[:3, 3],
-        "coarse_position_m": se3_inverse(tracked.coarse)[:3, 3],
-        "coarse_tried": tracked.coarse_tried,
-        "coarse_found": tracked.coarse_found,
-    }
-
-
-def _structure(m: Map, optics: Optics, sigma_px: float) -> Notes:
-    """Keyframes and points as the Step tells them, for errors of so many px."""
-    worlds = np.array([se3_inverse(pose) for pose in m.poses])
-    return {
-        "keyframe_number": m.frames,
-        "keyframe_position_m": worlds[:, :3, 3],
-        "keyframe_quat_xyzw": Rotation.from_matrix(worlds[:, :3, :3]).as_quat(),
-        "map_id": m.ids,
-        "map_point_m": m.points,
-        "map_point_sigma_m": baseline_map.sigma_along_rays(m, optics, sigma_px),
-        "map_point_views": np.diff(m.first),
-    }
-
-
-def _bundle_notes(adjusted: Sequence[Adjusted]) -> Notes:
-    """What the local and the global bundle did."""
-    keyframes, iterations, outliers = np.zeros((3, 2), np.int64)
-    cost = np.full((2, 2), math.nan)
-    for i, (_, bundle, dropped) in enumerate(adjusted):
-        if bundle is not None:
-            keyframes[i] = np.count_nonzero(np.any(bundle.covariance != 0, axis=(1, 2)))
-            iterations[i], outliers[i] = bundle.iterations, dropped
-            cost[i] = bundle.cost[[0, bundle.iterations]]
-    return {
-        "bundle_keyframes": keyframes,
-        "bundle_iterations": iterations,
-        "bundle_cost": cost,
-        "bundle_outliers": outliers,
-    }

@@ -21,7 +21,6 @@ from pipelines.semidirect.baseline_search import SearchOptions, Sources, View, f
 from pipelines.semidirect.optics import Optics, rays
 from pipelines.semidirect.pyramid import Grey
 from pipelines.semidirect.refinement import Bundle, BundleOptions, Observations, adjust, oldest_fixed, refine_points
-from pipelines.semidirect.step import Feature
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -64,7 +63,7 @@ class Map:
     @property
     def first(self) -> Longs:
         """Where each point's observations begin [n + 1]."""
-        return np.searchsorted(self.seen.point, np.arange(len(self.points) + 1))
+        return np.append(0, np.cumsum(np.bincount(self.seen.point, minlength=len(self.points))))
 
     @property
     def observations(self) -> Observations:
@@ -130,7 +129,7 @@ def with_points(m: Map, points: Floats, seen: Seen) -> Map:
 
 
 def without(m: Map, *, points: Flags | None = None, seen: Flags | None = None, keyframe: int = -1) -> Map:
-    """The map less some points [n], observations [m] and a keyframe, and less the points that are left with one view."""
+    """The map less some points [n], observations [m] and a keyframe, and less points that are left with one view."""
     stays = np.ones(len(m.seen.point), np.bool_) if seen is None else ~seen
     if points is not None:
         stays &= ~points[m.seen.point]
@@ -174,6 +173,8 @@ def with_new_points(m: Map, optics: Optics, growth: Growth) -> Map:
     """
     new = len(m.frames) - 1
     pose, view, mine = m.poses[new], m.views[new], m.seen.keyframe == new
+    if not np.any(mine):
+        return m
     other = int(m.nearest(se3_inverse(pose)[:3, 3])[1])
     corners = free_corners(view, m.seen.pixels[mine], m.seen.level[mine], growth.cell_px, growth.min_score)
     bearings = rays(optics, corners.pixels)
@@ -221,9 +222,8 @@ def found_again(m: Map, optics: Optics, rows: Longs, keyframes: Longs, options: 
         match = find_points(
             optics, m.buffers, m.poses, m.views[k], m.poses[k], m.points[asked], m.sources(asked), options
         )
-        got = match.outcome == Feature.MATCHED
-        more = Seen(asked[got], np.full(np.count_nonzero(got), k), match.found[got], match.level[got])
-        m = with_seen(m, more)
+        got = match.matched
+        m = with_seen(m, Seen(asked[got], np.full(match.found_count, k), match.found[got], match.level[got]))
     return m
 
 
@@ -239,7 +239,7 @@ class Adjusted(NamedTuple):
 
 
 def local_bundle(m: Map, optics: Optics, moving: int, options: BundleOptions) -> Adjusted:
-    """The newest keyframe and those nearest to it move with all points that they see; the others that see these hold."""
+    """The newest keyframe and those nearest to it move with the points that they see; others that see these hold."""
     free = np.zeros(len(m.frames), np.bool_)
     free[m.nearest(se3_inverse(m.poses[-1])[:3, 3])[:moving]] = True
     return _adjusted(m, optics, free & ~oldest_fixed(len(free)), options)

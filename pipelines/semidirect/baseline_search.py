@@ -156,6 +156,16 @@ class Matches(NamedTuple):
     outcome: Longs
     score: Floats
 
+    @property
+    def matched(self) -> NDArray[np.bool_]:
+        """Which of them were found [n]."""
+        return np.asarray(self.outcome == Feature.MATCHED)
+
+    @property
+    def found_count(self) -> int:
+        """How many."""
+        return int(np.count_nonzero(self.matched))
+
 
 @compiled
 def projected(optics: Optics, cam_T_world: Floats, points: Floats) -> Floats:
