@@ -60,7 +60,7 @@ def _bars(results: Results) -> Iterator[Statement]:
             yield Statement(
                 f"{mode}: the tracking makes {least:g} frames/s on an idle core",
                 _judged(min(rates) >= least),
-                f"{min(rates):.0f} to {max(rates):.0f} frames/s of CPU time, by the median frame of each flight",
+                f"{_span(rates, '.0f')} frames/s of CPU time, by the median frame of each flight",
             )
     semidirect = [(f, r) for f, r in results.results() if r.method in (FAST, ACCURATE)]
     if semidirect:
@@ -106,7 +106,7 @@ def _alike(pairs: Sequence[tuple[Flown, Result, Result]]) -> Statement:
     return Statement(
         "Fast and accurate mode hardly differ in accuracy",
         _judged(bool(np.all((ratios <= SIMILAR) & (ratios >= 1 / SIMILAR)))),
-        f"the fast mode's error is {ratios.min():.1f} to {ratios.max():.1f} times the accurate one's",
+        f"the fast mode's error is {_span(ratios.tolist(), '.1f')} times the accurate one's",
     )
 
 
@@ -115,7 +115,7 @@ def _quicker(pairs: Sequence[tuple[Flown, Result, Result]]) -> Statement:
     return Statement(
         f"The fast mode's tracking makes {PAPER_RATIO:.1f} times the baseline's frames/s",
         _judged(min(ratios) >= PAPER_RATIO),
-        f"{min(ratios):.1f} to {max(ratios):.1f} times, CPU time in turns",
+        f"{_span(ratios, '.1f')} times, CPU time in turns",
     )
 
 
@@ -130,13 +130,19 @@ def _honest(flown: Sequence[tuple[Flown, Result]]) -> Statement:
     return Statement(
         f"No mode stands by a wrong motion for more than {HONEST_FRAMES} frames",
         _judged(frames <= HONEST_FRAMES),
-        f"at most {frames} frames, {worst[1].method} on {worst[0].flight}",
+        f"at most {frames} frames, {worst[1].method} on {worst[0].flight}" if frames else "no wrong motion at all",
     )
 
 
 def _rate(flight: Flown, method: str) -> float | None:
     result = flight.of(method)
     return None if result is None else result.work.frames_per_s
+
+
+def _span(values: Sequence[float], form: str) -> str:
+    """Least and largest of some values."""
+    least, largest = (format(value, form) for value in (min(values), max(values)))
+    return least if least == largest else f"{least} to {largest}"
 
 
 def _lost(result: Result) -> str:
