@@ -99,6 +99,18 @@ def test_the_same_flight_gives_the_same_steps() -> None:
     assert all(np.array_equal(a.position_m, b.position_m) for a, b in zip(one, two, strict=True))
 
 
+def test_an_image_of_sixteen_bits_is_the_same() -> None:
+    samples, _ = flight()
+    eight = [s for s in samples[:30] if isinstance(s, ImageSample)]
+    deep = [
+        dataclasses.replace(
+            s, encoding="mono16", step_bytes=480, big_endian=False, payload=(s.grey().astype("<u2") << 8).tobytes()
+        )
+        for s in eight
+    ]
+    np.testing.assert_array_equal(flown([*deep])[-1].position_m, flown([*eight])[-1].position_m)
+
+
 def test_a_jump_is_lost_and_begun_anew() -> None:
     samples, _ = flight()
     later = [dataclasses.replace(s, t_ns=samples[39].t_ns + 1 + k) for k, s in enumerate(samples[85:])]

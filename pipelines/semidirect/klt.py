@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 from scipy.spatial.transform import Rotation
 
+from pipelines.correlation.odometry import eight_bit
 from pipelines.estimator import EstimatorError
 from pipelines.geometry import heading_of_quat, wrap_angle
 from pipelines.semidirect.optics import Optics, optics_of, rays
@@ -118,17 +119,18 @@ class KltOdometry:
         return None
 
     def step(self, state: State | None, sample: Sample, /) -> tuple[State | None, VisualStep | None]:
-        """Follow the corners into the next image.
+        """Follow the corners into the next image; what cannot be decoded before the first one gives no Step.
 
         Raises:
             ValueError: the settings do not tell the camera.
         """
         if not isinstance(sample, ImageSample):
-            unreadable = isinstance(sample, Problem) and state is not None
-            return state, _skipped(state, sample, Verdict.UNDECODABLE) if unreadable and state else None
+            if state is None or not isinstance(sample, Problem):
+                return state, None
+            return state, _skipped(state, sample, Verdict.UNDECODABLE)
         if state is not None and sample.t_ns <= state.t_ns:
             return state, _skipped(state, sample, Verdict.OUT_OF_ORDER)
-        image = np.asarray(sample.grey(), np.uint8)
+        image = eight_bit(sample.grey())
         if state is None:
             begun = self._keyframe(image, sample, self._start_pose(), LEVEL, self._height_m, 0)
             return begun, _step(begun, None, sample, Stage.STARTED, Verdict.FIRST_FRAME)
