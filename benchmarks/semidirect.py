@@ -75,7 +75,7 @@ def print_rows(rows: Sequence[Row]) -> None:
     print("\nstages, CPU ms of the median frame that has them:")
     for row in rows:
         named = zip(STAGES[row.method], row.stages.tolist(), strict=True)
-        print(f"{row.method:10}" + (", ".join(f"{name} {ms:.2f}" for name, ms in named) or "all in one"))
+        print(f"{row.method:10}" + (", ".join(f"{name} {ms:.2f}" for name, ms in named if ms > 0) or "all in one"))
     print("\nframe rate of the tracking, times the peer's:")
     peers = [row for row in rows if row.method in (BASELINE, KLT)]
     for row in rows:

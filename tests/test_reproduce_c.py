@@ -108,6 +108,12 @@ def test_methods_are_built_with_the_camera_and_their_presets() -> None:
     assert (settings[FAST].max_keyframes, settings[ACCURATE].max_keyframes) == (10, 50)
 
 
+@pytest.mark.parametrize("method", METHODS)
+def test_a_setting_that_a_method_does_not_have_is_refused(method: str) -> None:
+    with pytest.raises(SettingsError, match="wings"):
+        built(method, {"focal_px": 420.0, "height_m": 1.5}, wings=2)
+
+
 def test_methods_by_name() -> None:
     assert chosen(()) == METHODS
     assert chosen((KLT, FAST, KLT)) == (FAST, KLT)

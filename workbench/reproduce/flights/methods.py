@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from typing import Any
 
-from pydantic import BaseModel
+from pydantic import BaseModel, ValidationError
 
 from pipelines.estimator import Estimator
 from workbench.settings import SettingsError
@@ -23,10 +23,10 @@ def built(method: str, camera: Values, **more: Any) -> Estimator[Any]:
     Args:
         method: one of `METHODS`.
         camera: values of `CameraSettings`.
-        more: settings of its own; those that it does not have are an error.
+        more: settings of its own; those that it does not have are an error, but for `stage_times` of one without.
 
     Raises:
-        SettingsError: there is no such method.
+        SettingsError: there is no such method, or no such setting.
     """
     if method not in _MAKERS:
         raise SettingsError(f"there is no method {method!r}; there are: {', '.join(METHODS)}")
@@ -62,12 +62,21 @@ def _baseline(method: str, values: Values) -> Estimator[Any]:
 def _klt(method: str, values: Values) -> Estimator[Any]:
     from pipelines.semidirect.klt import KltOdometry, KltSettings
 
-    return KltOdometry(_over(KltSettings(), {k: v for k, v in values.items() if k in KltSettings.model_fields}))
+    return KltOdometry(_over(KltSettings(), {k: v for k, v in values.items() if k != "stage_times"}))  # it has none
 
 
 def _over(settings: BaseModel, values: Values) -> Any:
-    """The settings with some values changed, validated."""
-    return type(settings).model_validate({**settings.model_dump(), **values})
+    """The settings with some values changed, validated.
+
+    Raises:
+        SettingsError: one that it does not have, or a value that it cannot have.
+    """
+    try:
+        return type(settings).model_validate({**settings.model_dump(), **values})
+    except ValidationError as error:
+        raise SettingsError(
+            f"{type(settings).__name__}: {error.errors()[0]['loc'][0]}: {error.errors()[0]['msg']}"
+        ) from error
 
 
 _MAKERS: dict[str, Callable[[str, Values], Estimator[Any]]] = {
