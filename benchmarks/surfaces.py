@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.correlation.kernels import correlation_surface
-from pipelines.simulation.families import FAMILIES, ground
+from pipelines.simulation.families import PAPER_GROUNDS, ground
 from pipelines.simulation.mission import PAPER_HEIGHT_M, nadir_camera
 from pipelines.simulation.render import expose, noise_key_of, radiance, world_h_pixel
 from pipelines.simulation.surfaces import Surface
@@ -76,7 +76,7 @@ def frame_ms(surface: Surface, passes: int = 30) -> float:
 def draw(path: str) -> None:
     """The nine families in rows of three, each named."""
     views = []
-    for name in FAMILIES:
+    for name in PAPER_GROUNDS:
         way = world_h_pixel(np.array([0.31, 0.12, 0.0]), MATRIX, PAPER_HEIGHT_M)
         view = np.clip(radiance(ground(name, seed=1), way, FRAME), 0, 255).astype(np.uint8)
         cv2.rectangle(view, (0, 0), (22 + 15 * len(name), 38), 0, -1)
@@ -94,7 +94,7 @@ def main() -> None:
     parser.add_argument("--picture")
     options = parser.parse_args()
     print("false matches in %   " + "".join(f"N = {side:<5d}" for side in SIDES))
-    for name in FAMILIES:
+    for name in PAPER_GROUNDS:
         rates = [false_peaks(ground(name, seed=s), SIDES, pairs=options.pairs, seed=s) for s in range(options.seeds)]
         print(f"{name:21}" + "".join(f"{100 * rate:<9.1f}" for rate in np.mean(rates, axis=0)))
     for label, scatter in (("without", False), ("with", True)):

@@ -1,7 +1,7 @@
 """The commands about recordings: inspect, replay, simulate, view, demo, reproduce, settings.
 
-Those about finished runs are in `cli_runs.py`, those about patrols in `cli_patrol.py`. Only these modules and
-`terminal.py` print.
+Those about finished runs are in `cli_runs.py`, those about patrols in `cli_patrol.py`, paper C's flights in
+`cli_flights.py`. Only these modules and `terminal.py` print.
 
 What a command concludes goes to stdout, progress and errors to stderr. Exit status: 0 done; 2 a request that
 cannot be met (one line says why); 3 the recording could be read only in part; 130 interrupted; 1 a fault of the
@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 
 import typer
 
-from workbench import cli_patrol, cli_runs
+from workbench import cli_flights, cli_patrol, cli_runs
 from workbench.options import EstimatorName, PresetName, SettingsFile, StartTime, StopTime, Stride
 from workbench.terminal import (
     FAULT,
@@ -974,6 +974,7 @@ def demo_recording() -> Path:
 reproduce = typer.Typer(help="Repeat a paper's experiment on simulated missions.", rich_markup_mode=None)
 app.add_typer(reproduce, name="reproduce", short_help="Repeat a paper's experiment on simulated missions.")
 cli_patrol.register(app, reproduce)
+cli_flights.register(reproduce)
 
 
 @reproduce.command(

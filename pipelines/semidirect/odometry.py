@@ -595,16 +595,16 @@ class SemidirectOdometry:
 
 
 class _Stopwatch:
-    """Adds up the time of the stages, ms; all NaN where it is not asked for."""
+    """Adds up the thread's CPU time of the stages, ms; all NaN where it is not asked for."""
 
     def __init__(self, running: bool) -> None:
-        self._running, self._since = running, time.perf_counter()
+        self._running, self._since = running, time.thread_time()
         self.ms = np.zeros(STAGES) if running else np.full(STAGES, np.nan)
 
     def lap(self, stage: int) -> None:
         """Count the time since the last lap for a stage."""
         if self._running:
-            now = time.perf_counter()
+            now = time.thread_time()
             self.ms[stage] += (now - self._since) * 1e3
             self._since = now
 

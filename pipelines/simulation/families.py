@@ -17,6 +17,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
 from typing import Any
 
 import numba as nb
@@ -324,7 +325,7 @@ def _lay(grey: Floats, height: Floats, bodies: Floats, light: Floats) -> None:
                 grey[i, j] = shade * (0.25 + 0.95 * max(glow, 0.0) / math.sqrt(1.0 + slope_x**2 + slope_y**2))
 
 
-# ------------------------------------------------------------------------------------------ the nine
+# ------------------------------------------------------------------------------------- the textures
 
 
 def _gravel(size_px: int, rng: Rng) -> Floats:
@@ -499,4 +500,8 @@ FAMILIES: dict[str, Family] = {
         y=Bond(PAVER_PX[0], _HIDDEN_PX, PAVER_PX[0], hidden=True),
         stagger=0.5,
     ),
+    "fractal": Family(partial(_fractal, beta=1.0), contrast=8.0, spectrum=1.0, mean_grey=125),
 }
+
+PAPER_GROUNDS = tuple(name for name in FAMILIES if name != "fractal")
+"""The kinds of ground of paper A."""

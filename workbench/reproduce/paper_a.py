@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 
-from pipelines.simulation.families import FAMILIES
+from pipelines.simulation.families import FAMILIES, PAPER_GROUNDS
 from workbench.reproduce import correction, experiment, limits, matrix, report
 from workbench.reproduce.conditions import CONDITIONS, FRAMES, surface_of
 from workbench.reproduce.documents import made_folder
@@ -47,7 +47,7 @@ class Plan:
     @property
     def surfaces(self) -> tuple[str, ...]:
         """The surfaces of matrix and limits."""
-        return (self.surface,) if self.surface else tuple(FAMILIES)
+        return (self.surface,) if self.surface else PAPER_GROUNDS
 
     @property
     def cells(self) -> list[experiment.Cell]:

@@ -19,27 +19,30 @@ class Part(BaseModel):
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     @classmethod
-    def kept(cls, folder: Path, identity: str) -> Self | None:
-        """The part that lies in a folder, None if it is not there, damaged, or one of another identity."""
+    def kept(cls, folder: Path, identity: str, name: str = "") -> Self | None:
+        """The part that lies in a folder, None if it is not there, damaged, or one of another identity.
+
+        `name` tells parts of the same class apart.
+        """
         try:
-            stored = json.loads(_file(folder, cls).read_text("utf-8"))
+            stored = json.loads(_file(folder, cls, name).read_text("utf-8"))
             if stored["identity"] != _digest(identity):
                 return None
             return cls.model_validate(stored["found"])
         except (OSError, ValueError, KeyError, TypeError, ValidationError):
             return None
 
-    def keep(self, folder: Path, identity: str) -> None:
+    def keep(self, folder: Path, identity: str, name: str = "") -> None:
         """Write the part into a folder, all of it or nothing."""
-        file = _file(folder, type(self))
+        file = _file(folder, type(self), name)
         file.parent.mkdir(exist_ok=True)
         half = file.with_suffix(".half")
         half.write_text(json.dumps({"identity": _digest(identity), "found": self.model_dump()}), encoding="utf-8")
         half.replace(file)
 
 
-def _file(folder: Path, part: type[Part]) -> Path:
-    return folder / "parts" / f"{part.__name__.lower()}.json"
+def _file(folder: Path, part: type[Part], name: str) -> Path:
+    return folder / "parts" / f"{name or part.__name__.lower()}.json"
 
 
 def _digest(text: str) -> str:
