@@ -167,8 +167,14 @@ class Run:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """The names of all fields but surfaces."""
-        return tuple(row.field for row in self.schema.rows if row.archetype is not Archetype.SURFACES)
+        """The names of all fields but surfaces and lists."""
+        apart = (Archetype.SURFACES, Archetype.LISTS)
+        return tuple(row.field for row in self.schema.rows if row.archetype not in apart)
+
+    @property
+    def lists(self) -> tuple[str, ...]:
+        """The names of the fields whose length changes from frame to frame."""
+        return self.schema.lists
 
     def columns(self, names: Iterable[str]) -> dict[str, NDArray[Any]]:
         """Some fields of all frames, [n, *shape] each.
