@@ -22,6 +22,7 @@ from pydantic import BaseModel
 
 from pipelines.estimator import Step
 from pipelines.evaluation import Trajectory
+from pipelines.semidirect.step import VisualStep
 from pipelines.verdict import Verdict
 from readers.streams import ImageSample, RecordingError
 from workbench.schema import Archetype, Schema, schema_of
@@ -29,6 +30,8 @@ from workbench.settings import Layer, Plugin, plugin, settings_values, validated
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from pipelines.spatial import SpatialPath
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -298,10 +301,31 @@ class Run:
 
     @functools.cached_property
     def trajectory(self) -> Trajectory | None:
-        """The estimated path, seen from above; None of an estimator that has none."""
+        """The estimated path, seen from above; None of an estimator that has none.
+
+        Of a visual odometry only frames whose pose was found; the others hold the last one.
+        """
         if "pose" not in self.fields:
             return None
-        return Trajectory.of(self.t_ns, self.column("pose"))
+        pose = self.column("pose")
+        if self.visual:
+            pose = np.where(self.column("accepted").astype(bool)[:, None], pose, np.nan)
+        return Trajectory.of(self.t_ns, pose)
+
+    @property
+    def visual(self) -> bool:
+        """Whether it is of a visual odometry with a map."""
+        return issubclass(self.step_type, VisualStep)
+
+    @functools.cached_property
+    def path_in_space(self) -> SpatialPath | None:
+        """The estimated path in space, of frames whose pose was found; None of an estimator that has only the plane."""
+        from pipelines.spatial import SpatialPath
+
+        if not self.visual:
+            return None
+        found = self.column("accepted").astype(bool)
+        return SpatialPath.of(self.t_ns[found], self.column("position_m")[found], self.column("quat_xyzw")[found])
 
     @functools.cached_property
     def reference_depths(self) -> Floats | None:

@@ -105,7 +105,23 @@ def _range() -> Plugin:
     return Plugin("range", RangeSettings, build, "ranges", RangeStep)
 
 
-BUILT_IN: Mapping[str, Callable[[], Plugin]] = {"correlation": _correlation, "range": _range}
+def _semidirect() -> Plugin:
+    from pipelines.semidirect.settings import SemidirectSettings
+    from pipelines.semidirect.step import SemidirectStep
+
+    def build(settings: SemidirectSettings) -> Estimator[Any]:
+        from pipelines.semidirect.odometry import SemidirectOdometry
+
+        return SemidirectOdometry(settings)
+
+    return Plugin("semidirect", SemidirectSettings, build, step=SemidirectStep)
+
+
+BUILT_IN: Mapping[str, Callable[[], Plugin]] = {
+    "correlation": _correlation,
+    "range": _range,
+    "semidirect": _semidirect,
+}
 
 
 def estimator_names() -> tuple[str, ...]:

@@ -67,9 +67,10 @@ class Joined(NamedTuple):
     values: NDArray[Any]
 
     @classmethod
-    def of(cls, lists: Sequence[NDArray[Any]]) -> Joined:
+    def of(cls, lists: Iterable[NDArray[Any]]) -> Joined:
         """Join the arrays of a list's column, one after another."""
-        return cls(np.array([len(one) for one in lists], np.int64), np.concatenate(list(lists)))
+        arrays = list(lists)
+        return cls(np.array([len(one) for one in arrays], np.int64), np.concatenate(arrays))
 
     @property
     def rows(self) -> Ints:
