@@ -80,6 +80,7 @@ class Bounds:
         surfaces_px: width and height of the mosaic of correlation surfaces.
         landmarks: of the range filter: slot, name, and upper end of the plot of ranges in m (0: the viewer's choice).
         smoothed: slots, from 1, of which there are smoothed ranges.
+        height_m: of the highest camera over the ground, for views in space.
     """
 
     frames: tuple[int, int] | None = None
@@ -88,6 +89,7 @@ class Bounds:
     surfaces_px: tuple[float, float] | None = None
     landmarks: tuple[tuple[int, str, float], ...] = ()
     smoothed: frozenset[int] = frozenset()
+    height_m: float = 0.0
 
 
 def sensor_blueprint(bounds: Bounds) -> rrb.Blueprint:

@@ -29,6 +29,7 @@ from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
 from pipelines.geometry import heading_of_quat
 from pipelines.ranging.step import RangeStep
+from pipelines.semidirect.step import SemidirectStep
 from pipelines.verdict import Severity, Verdict
 from readers.streams import ImageError, ImageSample, PoseSample, RecordingError, Sample
 from workbench import traces
@@ -55,6 +56,7 @@ from workbench.rrd_ranges import RangeDrawing
 from workbench.rrd_reading import around, chunks, listed
 from workbench.rrd_reading import merge as merge
 from workbench.rrd_reading import recover as recover
+from workbench.rrd_semidirect import SemidirectDrawing
 from workbench.rrd_samples import SampleLog, is_grey
 from workbench.schema import Archetype, Row, Schema, schema_of
 
@@ -69,7 +71,11 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-_DRAWINGS: Mapping[type[Step], type[Drawing]] = {CorrelationStep: CorrelationDrawing, RangeStep: RangeDrawing}
+_DRAWINGS: Mapping[type[Step], type[Drawing]] = {
+    CorrelationStep: CorrelationDrawing,
+    RangeStep: RangeDrawing,
+    SemidirectStep: SemidirectDrawing,
+}
 
 
 class _Writer(abc.ABC):
