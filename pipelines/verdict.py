@@ -67,6 +67,15 @@ class Verdict(enum.IntFlag):
     INPUT_MISSING = 1 << 38
     INPUT_OUT_OF_ORDER = 1 << 39
     INPUT_UNREADABLE = 1 << 40
+    STARTING = 1 << 41
+    SCALE_UNKNOWN = 1 << 42
+    SCALE_DRIFT = 1 << 43
+    FEW_POINTS = 1 << 44
+    POINTS_DROPPED = 1 << 45
+    ALIGNMENT_FAILED = 1 << 46
+    RELOCALISED = 1 << 47
+    AFTER_RELOCALISATION = 1 << 48
+    NEW_MAP = 1 << 49
 
     @property
     def sentence(self) -> str:
@@ -122,6 +131,15 @@ _SENTENCES: dict[Verdict, str] = {
     Verdict.INPUT_MISSING: "there is no speed or no rate of turn yet: landmarks cannot be carried on",
     Verdict.INPUT_OUT_OF_ORDER: "a speed or rate of turn came late: after a later one, or after its frame",
     Verdict.INPUT_UNREADABLE: "a message with a speed or rate of turn could not be used",
+    Verdict.STARTING: "no map yet: corners are followed until the camera has moved far enough",
+    Verdict.SCALE_UNKNOWN: "nothing told the scale: lengths are in units of the first map's depth",
+    Verdict.SCALE_DRIFT: "the height over the map differs from the sensor's: the scale has drifted",
+    Verdict.FEW_POINTS: "too few map points were found in the frame",
+    Verdict.POINTS_DROPPED: "far fewer map points were found than in the frame before",
+    Verdict.ALIGNMENT_FAILED: "the sparse alignment had too few patches or no solution",
+    Verdict.RELOCALISED: "found again by a keyframe of the map",
+    Verdict.AFTER_RELOCALISATION: "the path was lost before: how it continues the path up to there is not sure",
+    Verdict.NEW_MAP: "a new map was begun: its place and scale do not continue the path before",
 }
 
 _SEVERITIES: dict[Verdict, Severity] = {
@@ -141,6 +159,9 @@ _SEVERITIES: dict[Verdict, Severity] = {
     Verdict.NEAR_FOCUS: Severity.NOTICE,
     Verdict.STANDSTILL: Severity.NOTICE,
     Verdict.INPUT_MISSING: Severity.ERROR,
+    Verdict.STARTING: Severity.NOTICE,
+    Verdict.SCALE_UNKNOWN: Severity.NOTICE,
+    Verdict.AFTER_RELOCALISATION: Severity.NOTICE,
 }
 
 

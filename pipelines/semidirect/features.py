@@ -239,11 +239,13 @@ class Outcome(IntEnum):
     FLAT = 4
     LEFT_IMAGE = 5
     NOT_CONVERGED = 6
+    NOT_TRIED = 7
 
 
 _ALIGNED, _OUT_OF_VIEW, _OBLIQUE = int(Outcome.ALIGNED), int(Outcome.OUT_OF_VIEW), int(Outcome.OBLIQUE)
 _REFERENCE_OUT_OF_VIEW, _FLAT = int(Outcome.REFERENCE_OUT_OF_VIEW), int(Outcome.FLAT)
 _LEFT_IMAGE, _NOT_CONVERGED = int(Outcome.LEFT_IMAGE), int(Outcome.NOT_CONVERGED)
+_NOT_TRIED = int(Outcome.NOT_TRIED)
 
 
 class FeatureOptions(NamedTuple):
@@ -356,16 +358,20 @@ def align_features(
     optics: Optics,
     cur_T_key: Floats,
     references: References,
+    cell: Longs,
+    wanted: int,
     options: FeatureOptions,
 ) -> Features:
-    """Find points of keyframes in the current frame.
+    """Find points of keyframes in the current frame, one a cell, until enough are found.
 
     Args:
         keyframes: the buffers [k, size] of the keyframes' pyramids, of the current frame's size.
         current: the current frame.
         optics: the camera.
         cur_T_key: transforms [k, 4, 4] from each keyframe to the current frame, as known so far.
-        references: what the keyframes saw of the points.
+        references: what the keyframes saw of the points, in the order in which they are tried.
+        cell: number of the cell [n] that each point lies in; a cell that has a point is not tried again.
+        wanted: so many points are enough.
         options: stop rules.
 
     Raises:
@@ -378,43 +384,68 @@ def align_features(
         np.full((n, 2), math.nan),
         np.full((n, 2), math.nan),
         np.full(n, -1, np.int64),
-        np.zeros(n, np.int64),
+        np.full(n, _NOT_TRIED, np.int64),
         np.full(n, math.nan),
         np.full(n, math.nan),
         np.zeros(n, np.int64),
         np.full((n, 2, 2), math.nan),
     )
     patch = np.empty((SIDE + 2, SIDE + 2))
+    taken = np.zeros(cell.max() + 1 if n else 0, np.bool_)
+    count = 0
     for i in range(n):
-        frame, depth, pixel = references.frame[i], references.depth[i], references.pixels[i]
-        t = cur_T_key[frame]
-        a, b = ray(optics, pixel[0], pixel[1])
-        place = project(
-            optics,
-            (t[0, 0] * a + t[0, 1] * b + t[0, 2]) * depth + t[0, 3],
-            (t[1, 0] * a + t[1, 1] * b + t[1, 2]) * depth + t[1, 3],
-            (t[2, 0] * a + t[2, 1] * b + t[2, 2]) * depth + t[2, 3],
-        )
-        found.predicted[i, 0], found.predicted[i, 1] = place.u, place.v
-        if not (0 <= place.u <= current.width - 1 and 0 <= place.v <= current.height - 1):
-            found.outcome[i] = _OUT_OF_VIEW
+        if count == wanted:
+            break
+        if taken[cell[i]]:
             continue
-        if not references.cosine[i] >= options.min_cosine:
-            found.outcome[i] = _OBLIQUE
-            continue
-        affine = affine_of_plane(optics, pixel, depth, references.normal[i], t)
-        found.affine[i] = affine
-        ref_level = references.level[i]
-        level = search_level(affine, ref_level)
-        found.level[i] = level
-        image = level_image(Pyramid(keyframes[frame], current.height, current.width), ref_level)
-        u, v = on_level(pixel[0], ref_level), on_level(pixel[1], ref_level)
-        if not warped_patch(image, u, v, affine * 2.0 ** (ref_level - level), patch):
-            found.outcome[i] = _REFERENCE_OUT_OF_VIEW
-            continue
-        u, v = on_level(place.u, level), on_level(place.v, level)
-        result = align_patch(level_image(current, level), patch, u, v, options)
-        found.outcome[i], found.iterations[i] = result.outcome, result.iterations
-        found.mean_difference[i], found.residual_rms[i] = result.mean_difference, result.residual_rms
-        found.pixels[i, 0], found.pixels[i, 1] = on_finest(result.u, level), on_finest(result.v, level)
+        _align_feature(keyframes, current, optics, cur_T_key, references, i, patch, options, found)
+        if found.outcome[i] == _ALIGNED:
+            taken[cell[i]] = True
+            count += 1
     return found
+
+
+@compiled
+def _align_feature(
+    keyframes: Grey,
+    current: Pyramid,
+    optics: Optics,
+    cur_T_key: Floats,
+    references: References,
+    i: int,
+    patch: Floats,
+    options: FeatureOptions,
+    found: Features,
+) -> None:
+    """Find one point; enter what came out in its row."""
+    frame, depth, pixel = references.frame[i], references.depth[i], references.pixels[i]
+    t = cur_T_key[frame]
+    a, b = ray(optics, pixel[0], pixel[1])
+    place = project(
+        optics,
+        (t[0, 0] * a + t[0, 1] * b + t[0, 2]) * depth + t[0, 3],
+        (t[1, 0] * a + t[1, 1] * b + t[1, 2]) * depth + t[1, 3],
+        (t[2, 0] * a + t[2, 1] * b + t[2, 2]) * depth + t[2, 3],
+    )
+    found.predicted[i, 0], found.predicted[i, 1] = place.u, place.v
+    if not (0 <= place.u <= current.width - 1 and 0 <= place.v <= current.height - 1):
+        found.outcome[i] = _OUT_OF_VIEW
+        return
+    if not references.cosine[i] >= options.min_cosine:
+        found.outcome[i] = _OBLIQUE
+        return
+    affine = affine_of_plane(optics, pixel, depth, references.normal[i], t)
+    found.affine[i] = affine
+    ref_level = references.level[i]
+    level = search_level(affine, ref_level)
+    found.level[i] = level
+    image = level_image(Pyramid(keyframes[frame], current.height, current.width), ref_level)
+    u, v = on_level(pixel[0], ref_level), on_level(pixel[1], ref_level)
+    if not warped_patch(image, u, v, affine * 2.0 ** (ref_level - level), patch):
+        found.outcome[i] = _REFERENCE_OUT_OF_VIEW
+        return
+    u, v = on_level(place.u, level), on_level(place.v, level)
+    result = align_patch(level_image(current, level), patch, u, v, options)
+    found.outcome[i], found.iterations[i] = result.outcome, result.iterations
+    found.mean_difference[i], found.residual_rms[i] = result.mean_difference, result.residual_rms
+    found.pixels[i, 0], found.pixels[i, 1] = on_finest(result.u, level), on_finest(result.v, level)

@@ -50,15 +50,17 @@ class CameraSettings(BaseModel):
         """
         if self.focal_px is None:
             raise ValueError("the camera is unknown: set focal_px (and centre_px), or give a calibration with --camera")
-        if self.image_size_px not in (None, (width_px, height_px)):
-            made_for = "{} x {} px".format(*self.image_size_px or ())
+        size = self.image_size_px or (width_px, height_px)
+        if size != (width_px, height_px):
             raise ValueError(
-                f"the calibration is for {made_for}, the images are {width_px} x {height_px} px: give --camera for "
-                "these images, or --scale-camera if they were resized"
+                f"the calibration is for {size[0]} x {size[1]} px, the images are {width_px} x {height_px} px: give "
+                "--camera for these images, or --scale-camera if they were resized"
             )
         centre = self.centre_px or ((width_px - 1) / 2, (height_px - 1) / 2)
         matrix = np.array([[self.focal_px, 0, centre[0]], [0, self.focal_y_px or self.focal_px, centre[1]], [0, 0, 1]])
         return Camera(
+            rectification=np.full((3, 3), np.nan),
+            projection=np.full((3, 4), np.nan),
             width_px=width_px,
             height_px=height_px,
             matrix=matrix,
@@ -123,7 +125,9 @@ class SemidirectSettings(CameraSettings):
 
     # lost and found
     min_tracked: Count = Field(50, description="fewer points are LOST")
-    max_drop: Count = Field(40, description="losing more points from one frame to the next is LOST")
+    max_drop: Fraction = Field(
+        0.5, description="losing a larger share of the points from one frame to the next is LOST"
+    )
     relocalise_correlation: Fraction = Field(0.7, description="least correlation of the small images")
     restart_s: NotNegative = Field(2.0, description="a new map is begun when lost for so long, 0: never")
 

@@ -191,4 +191,4 @@ class SemidirectStep(VisualStep):
     map_height_m: float = quantity("m", "height over the plane of the points seen")
 
     # 10. work: what the frame cost
-    stage_ms: Floats = quantity("ms", "time of pyramid, alignment, features, refinement, mapping; NaN unless asked for", 5)
+    stage_ms: Floats = quantity("ms", "time of pyramid, alignment, features and pose, start or search, mapping", 5)

@@ -1,0 +1,90 @@
+"""Mapping in a thread beside tracking. The compiled parts run without the interpreter lock.
+
+The thread takes posed frames one after the other and publishes a new map after each. When it falls behind, only the
+newest frames that wait are kept: a depth filter that misses a frame loses nothing but that measurement. What a frame
+meets in the map depends on the thread's timing, so that a replay differs from time to time.
+"""
+
+from __future__ import annotations
+
+import threading
+from collections import deque
+
+import numpy as np
+from numpy.typing import NDArray
+
+from pipelines.geometry import se3_inverse, se3_product
+from pipelines.semidirect.local_map import LocalMap
+from pipelines.semidirect.mapping import Mapper, Posed
+
+Floats = NDArray[np.float64]
+
+WAITING = 4
+"""Frames that may wait for the mapping."""
+
+
+class Beside:
+    """A mapper in a thread of its own, which ends with the program.
+
+    Args:
+        mapper: what grows the map.
+    """
+
+    def __init__(self, mapper: Mapper) -> None:
+        self._mapper = mapper
+        self._waiting: deque[Posed] = deque(maxlen=WAITING)
+        self._change = threading.Condition()
+        self._world: LocalMap | None = None
+        self._epoch = 0
+        self._shift: list[tuple[int, Floats]] = []
+        self._failed: Exception | None = None
+        threading.Thread(target=self._work, name="mapping", daemon=True).start()
+
+    def begin(self, world: LocalMap) -> None:
+        """Go on from a map; what waits for the one before is dropped."""
+        with self._change:
+            self._world, self._epoch = world, self._epoch + 1
+            self._waiting.clear()
+            self._shift.clear()
+
+    def post(self, posed: Posed) -> None:
+        """Give a frame to the thread."""
+        with self._change:
+            self._waiting.append(posed)
+            self._change.notify()
+
+    def newest(self, *, since: int) -> tuple[LocalMap, Floats]:
+        """The newest map, and how adjustments moved the poses [4, 4] of frames up to number `since`: T ← T shift.
+
+        Raises:
+            Exception: what the mapping raised.
+        """
+        with self._change:
+            if self._failed is not None:
+                raise self._failed
+            assert self._world is not None
+            shift = np.eye(4)
+            for number, by in self._shift:
+                if number <= since:
+                    shift = se3_product(shift, by)
+            self._shift.clear()
+            return self._world, shift
+
+    def _work(self) -> None:
+        while True:
+            with self._change:
+                self._change.wait_for(lambda: bool(self._waiting))
+                posed, world, epoch = self._waiting.popleft(), self._world, self._epoch
+            assert world is not None
+            try:
+                growth = self._mapper.grown(world, posed)
+            except Exception as error:
+                with self._change:
+                    self._failed = error
+                return
+            with self._change:
+                if epoch == self._epoch:
+                    self._world = growth.world
+                    if growth.keyframe:
+                        by = se3_product(se3_inverse(posed.cam_t_world), growth.cam_t_world)
+                        self._shift.append((posed.number, by))
