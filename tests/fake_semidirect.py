@@ -54,7 +54,7 @@ def _step(rng: np.random.Generator, frame: int, points: NDArray[np.float64], sca
     made = tracked and frame % 12 == 4
     k = 1 + frame // 12 if made else 0
     p = len(points) if made else 0
-    place = position(frame if tracked else LOST.start - 1) if frame > 4 else np.zeros(3) + [0, 0, HEIGHT]
+    place = position(frame if tracked else LOST.start - 1) if frame > 4 else np.array([0.0, 0.0, HEIGHT])
     turn = DOWN.as_quat()
     alarms = Verdict.FIRST_FRAME if frame == 0 else Verdict.LOST if stage is Stage.LOST else Verdict.OK
     seen = rng.integers(0, len(points), m)

@@ -1,8 +1,8 @@
 """The numbers by which runs are compared, checked and swept: a run's summary as names and numbers.
 
 Names are dotted: ``frames``, ``verdict.PEAK_AMBIGUOUS`` and ``alarm.…`` (frames), ``share.OK`` (%),
-``drift_percent``, ``ape_m.rmse``, ``rpe.1 s.translation_m.rmse``, ``ranging.error.median_percent``, ``odometry.losses``,
-``finding.motion-blur`` and ``findings.error`` (how many).
+``drift_percent``, ``ape_m.rmse``, ``rpe.1 s.translation_m.rmse``, ``ranging.error.median_percent``,
+``odometry.losses``, ``finding.motion-blur`` and ``findings.error`` (how many).
 """
 
 from __future__ import annotations

@@ -56,8 +56,8 @@ from workbench.rrd_ranges import RangeDrawing
 from workbench.rrd_reading import around, chunks, listed
 from workbench.rrd_reading import merge as merge
 from workbench.rrd_reading import recover as recover
-from workbench.rrd_semidirect import SemidirectDrawing
 from workbench.rrd_samples import SampleLog, is_grey
+from workbench.rrd_semidirect import SemidirectDrawing
 from workbench.schema import Archetype, Row, Schema, schema_of
 
 if TYPE_CHECKING:
@@ -501,7 +501,9 @@ def read_fields(
         elif row.archetype is Archetype.SURFACES:
             formats = rows[row.entity, _FORMAT][2]
             table[row.field] = _surfaces(rows[row.entity, row.component][2], formats, table)
-    table |= listed(schema, {row.field: rows[row.entity, row.component][2] for row in needed if row.field in schema.lists})
+    table |= listed(
+        schema, {row.field: rows[row.entity, row.component][2] for row in needed if row.field in schema.lists}
+    )
     return {field: table[field] for field in wanted}
 
 

@@ -44,7 +44,9 @@ class VisualDrawing(Drawing):
 
     def constants(self) -> None:  # noqa: D102
         point, thin = rr.Radius.ui_points, rr.Radius.ui_points(0.75)
-        self.file.static(f"{self.image}/predicted", rr.Points2D.from_fields(colors=0xFFFFFFA0, radii=point(1.5), draw_order=11))
+        self.file.static(
+            f"{self.image}/predicted", rr.Points2D.from_fields(colors=0xFFFFFFA0, radii=point(1.5), draw_order=11)
+        )
         self.file.static(f"{self.image}/missed", rr.Points2D.from_fields(radii=point(2.5), draw_order=12))
         self.file.static(f"{self.image}/features", rr.Points2D.from_fields(draw_order=13))
         self.file.static(f"{self.world}/corrected", rr.Points3D.from_fields(radii=point(2)))
@@ -208,7 +210,9 @@ class VisualDrawing(Drawing):
         across = [[(x, y0, 0), (x, y1, 0)] for x in np.arange(np.ceil(x0 / step), x1 / step) * step]
         along = [[(x0, y, 0), (x1, y, 0)] for y in np.arange(np.ceil(y0 / step), y1 / step) * step]
         lines = np.array([*across, *along], np.float32).reshape(-1, 2, 3)
-        self.file.static(f"{self.world}/plane", rr.LineStrips3D(lines, colors=0x455A64FF, radii=rr.Radius.ui_points(0.4)))
+        self.file.static(
+            f"{self.world}/plane", rr.LineStrips3D(lines, colors=0x455A64FF, radii=rr.Radius.ui_points(0.4))
+        )
 
 
 class SemidirectDrawing(VisualDrawing):
@@ -272,7 +276,10 @@ class SemidirectDrawing(VisualDrawing):
         good = traces.finite(places.values, 1)
         self._points("filters", table, places, good, colors=colours[good])
         sigma, scale = np.concatenate(table["filter_sigma"]), np.concatenate(table["filter_range"])
-        medians = [visual.quantiles(Joined(ends.counts, values), 0.5) for values in (sigma / scale, np.concatenate(table["filter_ratio"]))]
+        medians = [
+            visual.quantiles(Joined(ends.counts, values), 0.5)
+            for values in (sigma / scale, np.concatenate(table["filter_ratio"]))
+        ]
         self.send("filters/spread", table, _scalars(np.column_stack(medians)))
 
     def _courses(self, table: traces.Columns) -> None:

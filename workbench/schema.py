@@ -321,6 +321,7 @@ _QUAT = ("qx", "qy", "qz", "qw")
 _TWIST = ("x", "y", "z", "rx", "ry", "rz")
 _FILTER_OUTCOMES = ("updated", "no match", "converged", "diverged", "unseen", "given up")
 """As `depth_filter.Outcome`, which comes with compiled code, and one more."""
+_STAGES = ("pyramid", "alignment", "features and pose", "start or search", "mapping")
 _STATES = "points `/camera/image/RUN/{}`".format
 _MAP = "`/world/runs/RUN/map/{}`".format
 _LIST = Archetype.LISTS
@@ -428,7 +429,7 @@ SEMIDIRECT = Schema(
         Row("relocalise_correlation", "relocalisation/correlation", title="correlation"),
         Row("height_m", "scale/height", title="sensor", also=_TABLE),
         Row("map_height_m", "scale/height", title="map", also=_TABLE),
-        Row("stage_ms", "work/stages", axes=("pyramid", "alignment", "features", "refinement", "mapping"), title=""),
+        Row("stage_ms", "work/stages", axes=_STAGES, title="time of"),
     ),
 )  # fmt: skip
 

@@ -395,7 +395,9 @@ def _visual_lines(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows.append(("in space", f"{sizes}, max {ape['max']:.4g} m after Sim(3); scale {space['scale']:.5g}{drifted}"))
     if "ape_without_scale_m" in space:
         rows.append(("in space", f"rmse {space['ape_without_scale_m']['rmse']:.4g} m after SE(3)"))
-    rows.append(("attitude", f"rmse {attitude['rmse']:.3g}°, max {attitude['max']:.3g}°, a constant mounting taken off"))
+    rows.append(
+        ("attitude", f"rmse {attitude['rmse']:.3g}°, max {attitude['max']:.3g}°, a constant mounting taken off")
+    )
     return rows
 
 

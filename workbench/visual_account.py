@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
 from pipelines import spatial
-from pipelines.evaluation import Evaluation, EvaluationError, Statistics, Trajectory, evaluate
 from pipelines.estimator import Step
+from pipelines.evaluation import Evaluation, EvaluationError, Statistics, Trajectory, evaluate
 from pipelines.geometry import Floats
 from pipelines.semidirect.step import Stage, VisualStep
 from pipelines.spatial import SpatialPath
@@ -191,9 +191,7 @@ class VisualAccount:
         pose = self._column("pose").reshape(-1, 3)[kept]
         estimate = Trajectory(self._column("t_ns")[kept].astype(np.int64), pose)
         try:
-            result = evaluate(
-                estimate, self._reference.path, with_scale=unit != METRES, offset_ns=self._offset_ns
-            )
+            result = evaluate(estimate, self._reference.path, with_scale=unit != METRES, offset_ns=self._offset_ns)
         except EvaluationError as error:
             return None, f"{sentence}; not compared: {error}"
         return result, sentence

@@ -63,7 +63,8 @@ def with_camera(
     if made_for not in (size_px, (0, 0)):
         raise StreamError(
             f"{recording.path}: {source_of(camera)} is for {made_for[0]} x {made_for[1]} px, but the images of {image} "
-            f"are {size_px[0]} x {size_px[1]} px: give --camera for these images, or --scale-camera if they were resized"
+            f"are {size_px[0]} x {size_px[1]} px: give --camera for these images, or --scale-camera if they were "
+            "resized"
         )
     return _with_mounting(filled(resolved, intrinsics(camera)), camera, [camera_sentence(camera)])
 
@@ -126,7 +127,9 @@ def _demand(recording: Recording, stream: str, what: str, tells: Any) -> None:
     """Raise an error where a stream is missing or none of its samples tells what it is for."""
     recording.stream(stream)
     if not any(tells(sample) for sample in recording.read([stream])):
-        raise StreamError(f"{recording.path}: {stream} holds no {what} that could tell the scale: choose another stream")
+        raise StreamError(
+            f"{recording.path}: {stream} holds no {what} that could tell the scale: choose another stream"
+        )
 
 
 def scale_notes(source: ScaleSource, reference: Reference) -> list[str]:

@@ -88,7 +88,9 @@ def sureness(sigma_m: Floats, depth_m: Floats) -> Floats:
     return np.asarray(np.where(np.isfinite(sigma_m / depth_m), np.clip(share, 0, 1), np.nan))
 
 
-def frusta(position_m: Floats, quat_xyzw: Floats, focal_px: tuple[float, float], size_px: Floats, depth: Floats) -> Floats:
+def frusta(
+    position_m: Floats, quat_xyzw: Floats, focal_px: tuple[float, float], size_px: Floats, depth: Floats
+) -> Floats:
     """The edges of cameras [K] as one strip each, [K, 11, 3].
 
     Args:
