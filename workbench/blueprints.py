@@ -307,7 +307,9 @@ def visual_blueprint(step_type: type[Step], run: str, estimator: str, bounds: Bo
     bounds = bounds or Bounds()
     root, image = f"/runs/{run}/{estimator}", f"/camera/image/{run}"
     semidirect = issubclass(step_type, SemidirectStep)
-    pictures = {"Image: matched green, failed by cause, predicted white": ("predicted", "features", "missed")}
+    pictures: dict[str, tuple[str, ...]] = {
+        "Image: matched green, failed by cause, predicted white": ("predicted", "features", "missed")
+    }
     if semidirect:
         pictures["Filters: epipolar segments by outcome"] = ("epipolar", "filters")
         pictures["Alignment: patches, green to red by residual"] = ("patches",)

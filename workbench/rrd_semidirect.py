@@ -262,7 +262,7 @@ class SemidirectDrawing(VisualDrawing):
         self._points("patches", table, patches, good, colors=visual.heat(residual[good] / visual.BAD_RESIDUAL))
         costs = visual.level_costs(table)
         self.send("alignment/level", table, _scalars(costs))
-        self.send("alignment/iterations", table, _scalars(np.stack(table["align_iterations"]).astype(float)))
+        self.send("alignment/iterations", table, _scalars(np.stack(list(table["align_iterations"])).astype(float)))
 
     def _epipolar(self, table: traces.Columns) -> None:
         ends, outcome = Joined.of(table["epipolar_px"]), np.concatenate(table["filter_outcome"])
