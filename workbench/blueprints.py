@@ -340,26 +340,26 @@ def _visual_maps(run: str, bounds: Bounds) -> rrb.Tabs:
     if bounds.extent is not None:
         reach = bounds.extent.size_m + 2 * bounds.height_m
         eye = rrb.EyeControls3D(
-            position=(bounds.extent.x_m - 0.35 * reach, bounds.extent.y_m - 0.75 * reach, 0.6 * reach),
+            position=(bounds.extent.x_m - 0.25 * reach, bounds.extent.y_m - 0.55 * reach, 0.5 * reach),
             look_target=(bounds.extent.x_m, bounds.extent.y_m, bounds.height_m / 2),
             eye_up=(0.0, 0.0, 1.0),
         )
     space = rrb.Spatial3DView(
         origin="/world",
-        contents=[f"{world}/**", "/world/scale"],
+        contents=[f"{world}/**", f"- {world}/above/**", "/world/scale"],
         name="Space: points by σ, keyframes orange, reference green",
         eye_controls=eye,
         overrides=hidden,
         background=[18, 20, 24],
     )
     above = _map(
-        run, bounds.extent, "Map: path blue, reference green", ("corrected",),
+        run, bounds.extent, "Map: path blue, reference green", ("above/path",),
         ["/world/reference/**", "/world/scale", *(f"{world}/{one}" for one in _FROM_ABOVE)],
     )  # fmt: skip
     return rrb.Tabs(space, above)
 
 
-_FROM_ABOVE = ("corrected", "body", "heading", "map/points")
+_FROM_ABOVE = ("above/**", "map/points")
 _VISUAL_PLOTS: Mapping[str, Sequence[tuple[str, str]]] = {
     "Tracking": (
         ("Points that agree with the pose", "tracked"),
@@ -414,7 +414,7 @@ def _visual_plots(root: str, frames: tuple[int, int] | None, *, semidirect: bool
         )
 
     groups = {**_VISUAL_PLOTS, **(_SEMIDIRECT_PLOTS if semidirect else {})}
-    tabs = [
+    tabs: list[Any] = [
         rrb.Horizontal(*(plot(name, [entity]) for name, entity in plots), name=tab) for tab, plots in groups.items()
     ]
     if semidirect:

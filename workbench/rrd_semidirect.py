@@ -50,8 +50,10 @@ class VisualDrawing(Drawing):
         self.file.static(f"{self.image}/missed", rr.Points2D.from_fields(radii=point(2.5), draw_order=12))
         self.file.static(f"{self.image}/features", rr.Points2D.from_fields(draw_order=13))
         self.file.static(f"{self.world}/corrected", rr.Points3D.from_fields(radii=point(2)))
-        self.file.static(f"{self.world}/heading", arrow("arrow", 1.5))
-        self.file.static(f"{self.world}/body", marker("corrected", 4.5))
+        above = f"{self.world}/above"
+        self.file.static(f"{above}/path", rr.Points3D.from_fields(radii=point(2)))
+        self.file.static(f"{above}/heading", arrow("arrow", 1.5))
+        self.file.static(f"{above}/body", marker("corrected", 4.5))
         self.file.static(f"{self.world}/map/points", rr.Points3D.from_fields(radii=point(1.5)))
         self.file.static(f"{self.world}/map/keyframes", rr.LineStrips3D.from_fields(colors=0xFFA726FF, radii=thin))
         names = list(visual.STAGE_NAMES)
@@ -160,7 +162,10 @@ class VisualDrawing(Drawing):
         self.send(f"{self.world}/camera", there, moved)
         places = position.astype(np.float32)
         self.send(f"{self.world}/corrected", there, rr.Points3D.columns(positions=places, colors=colours))
-        self.send(f"{self.world}/body", there, rr.Points3D.columns(positions=places))
+        above = f"{self.world}/above"
+        ground, on_top = (flat(position[:, :2], layer) for layer in ("corrected", "markers"))
+        self.send(f"{above}/path", there, rr.Points3D.columns(positions=ground, colors=colours))
+        self.send(f"{above}/body", there, rr.Points3D.columns(positions=on_top))
         self._path.append((there["frame"], there["t_ns"], position, table["pose"][good], table["map_number"][good]))
 
     def _stages(self, table: traces.Columns) -> None:
@@ -185,8 +190,8 @@ class VisualDrawing(Drawing):
         extent = Extent.of(np.concatenate([position[:, :2], *([] if given is None else [given.corners])]))
         self.file.scale_bar(extent)
         vectors = ARROW_SHARE * extent.size_m * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
-        arrows = rr.Arrows3D.columns(vectors=flat(vectors), origins=position.astype(np.float32))
-        self.file.send(f"{self.world}/heading", frames, t_ns, arrows)
+        arrows = rr.Arrows3D.columns(vectors=flat(vectors), origins=flat(position[:, :2], "arrows"))
+        self.file.send(f"{self.world}/above/heading", frames, t_ns, arrows)
         depths = np.concatenate(self._depths)
         depth = float(np.median(depths)) if len(depths) else 1.0
         self._camera(CAMERA_DEPTH * depth)
@@ -240,10 +245,11 @@ class SemidirectDrawing(VisualDrawing):
         self.file.static(f"{entity}/ratio", rr.SeriesLines(names=["a/(a+b)", "C1"], colors=[0x66BB6AFF, 0x9E9E9EFF]))
 
     def legends(self, table: traces.Columns) -> Mapping[str, Any]:  # noqa: D102
-        levels = len(table["align_iterations"][0])
-        names = [f"level {k + 1} {when}" for k in range(levels) for when in ("before", "after")]
+        coarsest = self.scene.coarsest_level if self.scene is not None else 0
+        levels = [abs(coarsest - k) for k in range(len(table["align_iterations"][0]))]
+        names = [f"level {level} {when}" for level in levels for when in ("before", "after")]
         self.file.static(f"{self.root}/alignment/level", rr.SeriesLines(names=names))
-        iterations = [f"level {k + 1}" for k in range(levels)]
+        iterations = [f"level {level}" for level in levels]
         self.file.static(f"{self.root}/alignment/iterations", rr.SeriesLines(names=iterations))
         return super().legends(table)
 
@@ -267,7 +273,7 @@ class SemidirectDrawing(VisualDrawing):
     def _epipolar(self, table: traces.Columns) -> None:
         ends, outcome = Joined.of(table["epipolar_px"]), np.concatenate(table["filter_outcome"])
         colours = np.array(visual.FILTER_COLOURS, np.uint32)[np.clip(outcome, 0, len(visual.FILTER_COLOURS) - 1)]
-        good = traces.finite(ends.values, 1)
+        good = traces.finite(ends.values, 1) & (outcome != visual.UNSEEN)
         some = ends.chosen(good)
         strips = (some.values.reshape(-1, 2, 2) + 0.5).astype(np.float32)
         columns = rr.LineStrips2D.columns(strips=strips, colors=colours[good])

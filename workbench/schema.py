@@ -336,9 +336,9 @@ VISUAL: tuple[Row, ...] = (
     Row("stage", "outcome", also=f"state lane `stage`; {_TABLE}"),
     Row("dt_s", "conditions", title="dt"),
     Row("image_size_px", "conditions", title="image", axes=("width", "height")),
-    Row("position_m", "pose/position", axes=_XYZ, title="camera", also="`/world/runs/RUN/camera`"),
+    Row("position_m", "pose/position", axes=_XYZ, title="camera", also="`/world/runs/RUN/camera`, `/corrected`"),
     Row("quat_xyzw", "pose/rotation", axes=_QUAT, title="rotation", also="`/world/runs/RUN/camera`"),
-    Row("pose", "pose/plane", axes=_HEADING, title="pose", also="`/world/runs/RUN/corrected`"),
+    Row("pose", "pose/plane", axes=_HEADING, title="pose", also="`/world/runs/RUN/above`"),
     Row("increment_m", "motion/increment", axes=_XY, title="Δ"),
     Row("path_step_m", "motion/increment", title="S"),
     Row("delta_heading_rad", "motion/delta_heading", title="Δα"),
@@ -504,6 +504,29 @@ board, or measured ranges say; it is computed beside the estimator, which never 
 | `/world/runs/RUN/camera`, `/camera/path` | where the camera is: reference, else dead reckoned |
 | `/world/runs/RUN/landmarks/points`, `/rays`, `/ellipses` | the landmarks from above, with their intervals and 2σ |
 | `/world/runs/RUN/landmarks/surveyed` | where they are, if that is known |
+
+## Every run of visual odometry
+Entities on the image and in the world stand once a frame, those of the map where it changed. Numbers in lists
+(`Lists`) are one row a frame, as many as there are; `workbench.rrd.read_fields` gives them back as arrays. `filters/…`
+and the patches are of the semi-direct odometry.
+
+| Entity | What |
+|---|---|
+| `/runs/RUN/ESTIMATOR/stage` | lane: starting, tracked, lost, … |
+| `/runs/RUN/ESTIMATOR/features/error` | median and 90 % quantile of the found points' reprojection error (px of the level) |
+| `/runs/RUN/ESTIMATOR/alignment/level`, `/iterations` | cost before and after (grey²), and iterations, of each level |
+| `/runs/RUN/ESTIMATOR/filters/spread` | medians over the filters of σ/z_range and of a/(a+b) |
+| `/runs/RUN/ESTIMATOR/filters/shown/K/depth`, `/ratio`, `/number` | μ, μ ± σ (1/m); a/(a+b) and C1; number of the filter that slot K (1 to 8) follows from its start to its end, one after another |
+| `/runs/RUN/ESTIMATOR/filters/diverged/ID/…` | the same of the first 16 filters that diverged, 300 frames back |
+| `/camera/image/RUN/features`, `/missed` | points where they were found, or expected and not found, coloured by outcome |
+| `/camera/image/RUN/predicted` | where the map's points were expected |
+| `/camera/image/RUN/patches` | patches of the alignment in the frame before, coloured by residual, red from 20 grey |
+| `/camera/image/RUN/epipolar`, `/filters` | segments that were searched, and what was found there, by outcome |
+| `/world/runs/RUN/camera` | the camera with its view |
+| `/world/runs/RUN/corrected`, `/path/corrected`, `/path/reference` | one point a frame; the whole path in space; the reference laid over it by Sim(3) |
+| `/world/runs/RUN/above/path`, `/body`, `/heading` | the path seen from above |
+| `/world/runs/RUN/map/points`, `/sigma` | the map's points, green where σ is 0.1 % of the scene's depth to red at 10 %; the same as balls of radius σ, hidden until switched on |
+| `/world/runs/RUN/map/keyframes`, `/plane` | frusta of the keyframes; z = 0, the first map's plane, as a grid |
 """
 
 

@@ -33,16 +33,12 @@ class VisualScene:
     Attributes:
         focal_px: focal length along u and v, px.
         centre_px: principal point, px.
-        max_features: how many points may be tracked.
-        keyframe_distance: share of the scene's depth from which a frame becomes a keyframe, NaN where there is none.
-        max_height_ratio: share of the height by which the map may differ from the sensor, NaN where there is none.
+        coarsest_level: of the pyramid that a sparse alignment begins with.
     """
 
     focal_px: tuple[float, float]
     centre_px: tuple[float, float] | None
-    max_features: int
-    keyframe_distance: float = math.nan
-    max_height_ratio: float = math.nan
+    coarsest_level: int = 0
 
     @classmethod
     def of(cls, settings: Any) -> VisualScene:
@@ -50,9 +46,7 @@ class VisualScene:
         return cls(
             focal_px=(settings.focal_px, settings.focal_y_px or settings.focal_px),
             centre_px=settings.centre_px,
-            max_features=getattr(settings, "max_features", 0),
-            keyframe_distance=getattr(settings, "keyframe_distance", math.nan),
-            max_height_ratio=getattr(settings, "max_height_ratio", math.nan),
+            coarsest_level=getattr(settings, "align_coarsest", 0),
         )
 
 
