@@ -180,7 +180,7 @@ class Run:
         return self.schema.lists
 
     def columns(self, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-        """Some fields of all frames, [n, *shape] each.
+        """Some fields of all frames, [n, *shape] each; lists are not for it, see `list_column`.
 
         Raises:
             RecordingError: the file cannot be read, or holds no such run.
@@ -274,6 +274,29 @@ class Run:
             for index in np.ndindex(array.shape[1:]):
                 columns[f"{name}[{','.join(map(str, index))}]" if index else name] = array[(slice(None), *index)]
         return pd.DataFrame(columns, index=pd.Index(self.frames, name="frame"))
+
+    def lists_at(self, frame: int) -> dict[str, NDArray[Any]]:
+        """The lists of one frame.
+
+        Raises:
+            RecordingError: the run has no such frame, or its file cannot be read.
+        """
+        from workbench.rrd import read_fields
+
+        if not self.lists:
+            return {}
+        found = read_fields(self.file, self.name, self.step_type, self.lists, range(frame, frame + 1))
+        return {name: values[0] for name, values in found.items()}
+
+    def list_column(self, name: str) -> NDArray[Any]:
+        """One list of all frames, an array [n] of arrays; it is large and not kept.
+
+        Raises:
+            RecordingError: the file cannot be read.
+        """
+        from workbench import rrd_reading
+
+        return rrd_reading.columns(self.file, self.root, self.schema, [name])[name]
 
     def steps(self, first: int, stop: int) -> list[Step]:
         """The Steps of the frames `first` to before `stop`, surfaces included.

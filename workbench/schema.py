@@ -433,6 +433,9 @@ SEMIDIRECT = Schema(
     ),
 )  # fmt: skip
 
+CLOCKED = frozenset({"stage_ms"})
+"""Fields that the machine's clock tells: no replay repeats them."""
+
 SCHEMAS: Mapping[type[Step], Schema] = {CorrelationStep: CORRELATION, RangeStep: RANGE, SemidirectStep: SEMIDIRECT}
 
 
@@ -508,24 +511,28 @@ board, or measured ranges say; it is computed beside the estimator, which never 
 ## Every run of visual odometry
 Entities on the image and in the world stand once a frame, those of the map where it changed. Numbers in lists
 (`Lists`) are one row a frame, as many as there are; `workbench.rrd.read_fields` gives them back as arrays. `filters/…`
-and the patches are of the semi-direct odometry.
+and the patches are of the semi-direct odometry. A slot of `filters/shown` follows one filter from its start to its
+end, then the next one that starts.
 
 | Entity | What |
 |---|---|
 | `/runs/RUN/ESTIMATOR/stage` | lane: starting, tracked, lost, … |
-| `/runs/RUN/ESTIMATOR/features/error` | median and 90 % quantile of the found points' reprojection error (px of the level) |
+| `/runs/RUN/ESTIMATOR/features/error` | median and 90 % quantile of the reprojection error (px of the level) |
 | `/runs/RUN/ESTIMATOR/alignment/level`, `/iterations` | cost before and after (grey²), and iterations, of each level |
 | `/runs/RUN/ESTIMATOR/filters/spread` | medians over the filters of σ/z_range and of a/(a+b) |
-| `/runs/RUN/ESTIMATOR/filters/shown/K/depth`, `/ratio`, `/number` | μ, μ ± σ (1/m); a/(a+b) and C1; number of the filter that slot K (1 to 8) follows from its start to its end, one after another |
+| `/runs/RUN/ESTIMATOR/filters/shown/K/depth` | μ, μ ± σ (1/m) of the filter that slot K follows, 1 to 8 |
+| `/runs/RUN/ESTIMATOR/filters/shown/K/ratio`, `/number` | its a/(a+b) and C1; its number |
 | `/runs/RUN/ESTIMATOR/filters/diverged/ID/…` | the same of the first 16 filters that diverged, 300 frames back |
-| `/camera/image/RUN/features`, `/missed` | points where they were found, or expected and not found, coloured by outcome |
+| `/camera/image/RUN/features`, `/missed` | points where they were found, or expected and not found, by outcome |
 | `/camera/image/RUN/predicted` | where the map's points were expected |
-| `/camera/image/RUN/patches` | patches of the alignment in the frame before, coloured by residual, red from 20 grey |
+| `/camera/image/RUN/patches` | patches of the alignment in the frame before, red from a residual of 20 grey |
 | `/camera/image/RUN/epipolar`, `/filters` | segments that were searched, and what was found there, by outcome |
 | `/world/runs/RUN/camera` | the camera with its view |
-| `/world/runs/RUN/corrected`, `/path/corrected`, `/path/reference` | one point a frame; the whole path in space; the reference laid over it by Sim(3) |
+| `/world/runs/RUN/corrected`, `/path/corrected` | one point a frame; the whole path in space |
+| `/world/runs/RUN/path/reference` | the reference laid over it by Sim(3) |
 | `/world/runs/RUN/above/path`, `/body`, `/heading` | the path seen from above |
-| `/world/runs/RUN/map/points`, `/sigma` | the map's points, green where σ is 0.1 % of the scene's depth to red at 10 %; the same as balls of radius σ, hidden until switched on |
+| `/world/runs/RUN/map/points` | the map's points, green where σ is 0.1 % of the scene's depth, red at 10 % |
+| `/world/runs/RUN/map/sigma` | the same as balls of radius σ, hidden until switched on |
 | `/world/runs/RUN/map/keyframes`, `/plane` | frusta of the keyframes; z = 0, the first map's plane, as a grid |
 """
 
