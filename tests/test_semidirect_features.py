@@ -191,8 +191,6 @@ def test_points_of_a_rendered_plane_are_found() -> None:
         optics_of(CAMERA),
         (wrong @ second @ np.linalg.inv(first))[None],
         refs,
-        np.arange(60),
-        60,
         FeatureOptions(),
     )
     truth = lens.project(CAMERA, moved(world, second))
@@ -218,7 +216,7 @@ def test_what_is_not_searched_says_why() -> None:
     poses = np.stack([np.eye(4), se3_exp(np.array([9.0, 0, 0, 0, 0, 0]))])
     refs.frame[0] = 1
     found = align_features(
-        np.stack([image.buffer, image.buffer]), image, optics_of(CAMERA), poses, refs, np.arange(4), 4, FeatureOptions()
+        np.stack([image.buffer, image.buffer]), image, optics_of(CAMERA), poses, refs, FeatureOptions()
     )
     assert found.outcome.tolist() == [
         Outcome.OUT_OF_VIEW, Outcome.OBLIQUE, Outcome.REFERENCE_OUT_OF_VIEW, Outcome.ALIGNED
@@ -227,4 +225,4 @@ def test_what_is_not_searched_says_why() -> None:
     assert np.isnan(found.pixels[:3]).all()
     small = pyramid_of(noise_texture((64, 64), 2, 9))
     with pytest.raises(ValueError, match="differ in size"):
-        align_features(small.buffer[None], image, optics_of(CAMERA), poses, refs, np.arange(4), 4, FeatureOptions())
+        align_features(small.buffer[None], image, optics_of(CAMERA), poses, refs, FeatureOptions())

@@ -144,15 +144,26 @@ def nearest_views(points: Floats, centre: Floats, first: Longs, frame: Longs, fr
         frame_centres: the keyframes' centres [k, 3].
     """
     n = len(points)
-    observation, cosine = np.full(n, -1, np.int64), np.full(n, -1.0)
+    observation, cosine = np.empty(n, np.int64), np.empty(n)
     for i in range(n):
-        x, y, z = centre - points[i]
-        for j in range(first[i], first[i + 1]):
-            a, b, c = frame_centres[frame[j]] - points[i]
-            found = (x * a + y * b + z * c) / math.sqrt((x * x + y * y + z * z) * (a * a + b * b + c * c))
-            if observation[i] < 0 or found > cosine[i]:
-                observation[i], cosine[i] = j, found
+        observation[i], cosine[i] = nearest_view(points[i], centre, first[i], first[i + 1], frame, frame_centres)
     return Views(observation, cosine)
+
+
+@compiled
+def nearest_view(
+    point: Floats, centre: Floats, begin: int, end: int, frame: Longs, frame_centres: Floats
+) -> tuple[int, float]:
+    """Of the observations begin to end - 1 of a point that from the nearest angle, and the angle's cosine."""
+    observation, cosine = -1, -1.0
+    x, y, z = centre[0] - point[0], centre[1] - point[1], centre[2] - point[2]
+    for j in range(begin, end):
+        of = frame_centres[frame[j]]
+        a, b, c = of[0] - point[0], of[1] - point[1], of[2] - point[2]
+        found = (x * a + y * b + z * c) / math.sqrt((x * x + y * y + z * z) * (a * a + b * b + c * c))
+        if observation < 0 or found > cosine:
+            observation, cosine = j, found
+    return observation, cosine
 
 
 @compiled
@@ -352,35 +363,9 @@ def align_patch(image: Grey, patch: Floats, u: float, v: float, options: Feature
 
 
 @compiled
-def align_features(
-    keyframes: Grey,
-    current: Pyramid,
-    optics: Optics,
-    cur_T_key: Floats,
-    references: References,
-    cell: Longs,
-    wanted: int,
-    options: FeatureOptions,
-) -> Features:
-    """Find points of keyframes in the current frame, one a cell, until enough are found.
-
-    Args:
-        keyframes: the buffers [k, size] of the keyframes' pyramids, of the current frame's size.
-        current: the current frame.
-        optics: the camera.
-        cur_T_key: transforms [k, 4, 4] from each keyframe to the current frame, as known so far.
-        references: what the keyframes saw of the points, in the order in which they are tried.
-        cell: number of the cell [n] that each point lies in; a cell that has a point is not tried again.
-        wanted: so many points are enough.
-        options: stop rules.
-
-    Raises:
-        ValueError: keyframes that are not of the current frame's size.
-    """
-    if keyframes.shape[1] != len(current.buffer):
-        raise ValueError("keyframes and current frame differ in size: align features of frames of one size")
-    n = len(references.frame)
-    found = Features(
+def no_features(n: int) -> Features:
+    """Room for n alignments, none of them tried."""
+    return Features(
         np.full((n, 2), math.nan),
         np.full((n, 2), math.nan),
         np.full(n, -1, np.int64),
@@ -390,36 +375,61 @@ def align_features(
         np.zeros(n, np.int64),
         np.full((n, 2, 2), math.nan),
     )
-    patch = np.empty((SIDE + 2, SIDE + 2))
-    taken = np.zeros(cell.max() + 1 if n else 0, np.bool_)
-    count = 0
-    for i in range(n):
-        if count == wanted:
-            break
-        if taken[cell[i]]:
-            continue
-        _align_feature(keyframes, current, optics, cur_T_key, references, i, patch, options, found)
-        if found.outcome[i] == _ALIGNED:
-            taken[cell[i]] = True
-            count += 1
-    return found
 
 
 @compiled
-def _align_feature(
+def align_features(
     keyframes: Grey,
     current: Pyramid,
     optics: Optics,
     cur_T_key: Floats,
     references: References,
-    i: int,
-    patch: Floats,
     options: FeatureOptions,
+) -> Features:
+    """Find points of keyframes in the current frame.
+
+    Args:
+        keyframes: the buffers [k, size] of the keyframes' pyramids, of the current frame's size.
+        current: the current frame.
+        optics: the camera.
+        cur_T_key: transforms [k, 4, 4] from each keyframe to the current frame, as known so far.
+        references: what the keyframes saw of the points.
+        options: stop rules.
+
+    Raises:
+        ValueError: keyframes that are not of the current frame's size.
+    """
+    if keyframes.shape[1] != len(current.buffer):
+        raise ValueError("keyframes and current frame differ in size: align features of frames of one size")
+    found, patch, r = no_features(len(references.frame)), np.empty((SIDE + 2, SIDE + 2)), references
+    for i in range(len(r.frame)):
+        key = Pyramid(keyframes[r.frame[i]], current.height, current.width)
+        t = cur_T_key[r.frame[i]]
+        align_feature(
+            key, current, optics, t, r.pixels[i], r.level[i], r.depth[i], r.normal[i], r.cosine[i], options, patch,
+            found, i,
+        )  # fmt: skip
+    return found
+
+
+@compiled
+def align_feature(
+    key: Pyramid,
+    current: Pyramid,
+    optics: Optics,
+    cur_T_key: Floats,
+    pixel: Floats,
+    ref_level: int,
+    depth: float,
+    normal: Floats,
+    cosine: float,
+    options: FeatureOptions,
+    patch: Floats,
     found: Features,
+    i: int,
 ) -> None:
-    """Find one point; enter what came out in its row."""
-    frame, depth, pixel = references.frame[i], references.depth[i], references.pixels[i]
-    t = cur_T_key[frame]
+    """Find one point, see `References`; enter what came out in row i. `patch` [10, 10] is room to work in."""
+    t = cur_T_key
     a, b = ray(optics, pixel[0], pixel[1])
     place = project(
         optics,
@@ -431,15 +441,14 @@ def _align_feature(
     if not (0 <= place.u <= current.width - 1 and 0 <= place.v <= current.height - 1):
         found.outcome[i] = _OUT_OF_VIEW
         return
-    if not references.cosine[i] >= options.min_cosine:
+    if not cosine >= options.min_cosine:
         found.outcome[i] = _OBLIQUE
         return
-    affine = affine_of_plane(optics, pixel, depth, references.normal[i], t)
+    affine = affine_of_plane(optics, pixel, depth, normal, t)
     found.affine[i] = affine
-    ref_level = references.level[i]
     level = search_level(affine, ref_level)
     found.level[i] = level
-    image = level_image(Pyramid(keyframes[frame], current.height, current.width), ref_level)
+    image = level_image(key, ref_level)
     u, v = on_level(pixel[0], ref_level), on_level(pixel[1], ref_level)
     if not warped_patch(image, u, v, affine * 2.0 ** (ref_level - level), patch):
         found.outcome[i] = _REFERENCE_OUT_OF_VIEW

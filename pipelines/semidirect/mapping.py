@@ -182,9 +182,11 @@ class Mapper:
         n = len(found.level)
         bearing = rays(self.optics, found.pixels)
         bearing /= np.linalg.norm(bearing, axis=1)[:, None]
-        belief = np.empty((n, 4))
-        belief[:] = depth_filter.started(depth, self.settings.filter_min_depth * depth)
-        reach = np.full(n, 1.0 / (self.settings.filter_min_depth * depth))
+        # the filter's depth is along the ray: that of a surface which faces the camera grows to the image's corners
+        away = depth / bearing[:, 2]
+        least = self.settings.filter_min_depth * away
+        belief = np.array([depth_filter.started(*pair) for pair in zip(away, least, strict=True)]).reshape(n, 4)
+        reach = 1.0 / least
         number = world.next_number + np.arange(n)
         fresh = Filters(
             number, np.full(n, k.number[-1]), found.pixels, found.level, bearing, belief, reach, np.zeros(n, np.int64)

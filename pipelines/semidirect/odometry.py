@@ -18,7 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.correlation.odometry import eight_bit
-from pipelines.estimator import EstimatorError
+from pipelines.estimator import EstimatorError, FrameImage, Images
 from pipelines.geometry import se3_exp, se3_inverse, se3_log, se3_product, wrap_angle
 from pipelines.semidirect import starting
 from pipelines.semidirect.beside import Beside
@@ -91,6 +91,7 @@ class SemidirectState:
     height_m: float = math.nan
     mean_grey: float = math.nan
     intervals_s: tuple[float, ...] = ()
+    camera: tuple[Any, ...] = ()
 
 
 class Met(NamedTuple):
@@ -137,7 +138,7 @@ class SemidirectOdometry:
     def start(self) -> SemidirectState:
         """The state before the first sample."""
         height = self._settings.height_m
-        return SemidirectState(height_m=math.nan if height is None else height)
+        return SemidirectState(height_m=math.nan if height is None else height, camera=self._settings.camera_key)
 
     def step(self, state: SemidirectState, sample: Sample, /) -> tuple[SemidirectState, SemidirectStep | None]:
         """Take one sample; an image, or the `Problem` of one, yields a Step.
@@ -165,6 +166,60 @@ class SemidirectOdometry:
         if sample.stream == s.position_stream and isinstance(sample, PoseSample):
             return replace(state, watch=state.watch.placed(sample.t_ns, sample.position_m)), None
         return state, None
+
+    # ---------------------------------------------------------------- going on from the middle
+
+    def packed(self, state: SemidirectState) -> SemidirectState:
+        """The state with the images of frames and keyframes by number, see `Resumable`."""
+        world, last, following = state.world, state.last, state.following
+        images: Any = None
+        if world is not None:
+            images = tuple(FrameImage(int(number)) for number in world.keyframes.number)
+            world = world._replace(keyframes=world.keyframes._replace(grey=images))
+        if last is not None:
+            images = FrameImage(last.number)
+            last = last._replace(pyramid=images)
+        if following is not None:
+            images = FrameImage(following.first.number)
+            first = following.first._replace(pyramid=images)
+            images = FrameImage(following.number)
+            following = following._replace(first=first, image=images)
+        return replace(state, world=world, last=last, following=following)
+
+    def unpacked(self, packed: Any, images: Images) -> SemidirectState:
+        """The state that was packed, see `Resumable`.
+
+        Raises:
+            EstimatorError: it is no state of this estimator.
+        """
+        if not isinstance(packed, SemidirectState):
+            raise EstimatorError(f"{type(packed).__name__} is no state of the estimator {self.name!r}; replay again")
+
+        def pyramid(number: int) -> Pyramid:
+            return self._pyramid(eight_bit(images(number)))
+
+        world, last, following = packed.world, packed.last, packed.following
+        if world is not None:
+            grey = np.stack([pyramid(int(number)).buffer for number in world.keyframes.number])
+            world = world._replace(keyframes=world.keyframes._replace(grey=grey))
+        if last is not None:
+            last = last._replace(pyramid=pyramid(last.number))
+        if following is not None:
+            first = following.first._replace(pyramid=pyramid(following.first.number))
+            following = following._replace(first=first, image=level_image(pyramid(following.number), 0))
+        return replace(packed, world=world, last=last, following=following)
+
+    def adopted(self, state: SemidirectState) -> SemidirectState:
+        """The state under these settings, see `Resumable`: the map stays, and grows as they say.
+
+        Raises:
+            EstimatorError: the settings are for another camera.
+        """
+        if state.camera != self._settings.camera_key:
+            raise EstimatorError(
+                "the map was made with another camera: replay from the start to change its calibration"
+            )
+        return state
 
     # ------------------------------------------------------------------------------ one frame
 
@@ -236,7 +291,7 @@ class SemidirectOdometry:
         assert self._tracker is not None
         following = state.following
         if following is not None:
-            following = starting.followed(following, pyramid)
+            following = starting.followed(following, number, pyramid)
         if following is None or len(following.which) < s.start_min_matches:
             following = starting.first_view(number, sample.t_ns, pyramid, s)
             new = replace(state, following=following)

@@ -42,6 +42,13 @@ class CameraSettings(BaseModel):
     position_sigma_m: Positive = Field(0.01, description="standard deviation of a coordinate of these, m")
     scale_way: Positive = Field(1.0, description="way, in units of the map, over which speed or positions are taken")
 
+    @property
+    def camera_key(self) -> tuple[Any, ...]:
+        """What tells one camera from another."""
+        return (
+            self.focal_px, self.focal_y_px, self.centre_px, self.distortion_model, self.distortion, self.image_size_px
+        )  # fmt: skip
+
     def camera(self, width_px: int, height_px: int) -> Camera:
         """The camera of images of that size.
 

@@ -43,9 +43,13 @@ class FirstView(NamedTuple):
 
 
 class Following(NamedTuple):
-    """Corners on their way: rows `which` [m] of the first view's corners, where they are now `pixels` [m, 2]."""
+    """Corners on their way to the frame `number`, whose image is `image`.
+
+    Rows `which` [m] of the first view's corners, and where they are now: `pixels` [m, 2].
+    """
 
     first: FirstView
+    number: int
     image: Grey
     which: Longs
     pixels: Floats
@@ -68,14 +72,14 @@ def first_view(number: int, t_ns: int, pyramid: Pyramid, settings: SemidirectSet
     found = corners(pyramid, np.zeros(cells_of(pyramid, options), np.bool_), options)
     best = np.sort(np.argsort(-found.score, kind="stable")[: settings.start_corners])
     view = FirstView(number, t_ns, pyramid, found.pixels[best], found.level[best])
-    return Following(view, level_image(pyramid, 0), np.arange(len(best)), view.corners)
+    return Following(view, number, level_image(pyramid, 0), np.arange(len(best)), view.corners)
 
 
-def followed(following: Following, pyramid: Pyramid) -> Following:
+def followed(following: Following, number: int, pyramid: Pyramid) -> Following:
     """The corners in the next frame, by pyramidal Lucas-Kanade forth and back; those that are lost drop out."""
     image = level_image(pyramid, 0)
     if not len(following.which):
-        return following._replace(image=image)
+        return following._replace(number=number, image=image)
     before = np.ascontiguousarray(following.pixels, np.float32)[:, None]
     window = (WINDOW_PX, WINDOW_PX)
     there, found, _ = cv2.calcOpticalFlowPyrLK(following.image, image, before, before.copy(), winSize=window)
@@ -84,7 +88,7 @@ def followed(following: Following, pyramid: Pyramid) -> Following:
     good &= np.linalg.norm((back - before)[:, 0], axis=1) < BACK_PX
     now = there[:, 0].astype(np.float64)
     good &= np.all((now > 0) & (now < (pyramid.width - 1, pyramid.height - 1)), axis=1)
-    return Following(following.first, image, following.which[good], now[good])
+    return Following(following.first, number, image, following.which[good], now[good])
 
 
 def begun(following: Following, optics: Optics, settings: SemidirectSettings) -> tuple[Start, Flags]:

@@ -13,13 +13,13 @@ from numpy.typing import NDArray
 
 from pipelines.compiled import compiled
 from pipelines.geometry import se3_inverse, se3_product
-from pipelines.semidirect import alignment, features, refinement
+from pipelines.semidirect import alignment, refinement
 from pipelines.semidirect.alignment import Alignment
-from pipelines.semidirect.features import FeatureOptions, References, nearest_views
+from pipelines.semidirect.features import SIDE, FeatureOptions, Features, align_feature, nearest_view, no_features
 from pipelines.semidirect.local_map import LocalMap, Sightings, centre_of, centres_of, projections, rows_of
 from pipelines.semidirect.optics import Optics, rays
-from pipelines.semidirect.pyramid import Pyramid
-from pipelines.semidirect.refinement import PoseOptions, RefinedPose
+from pipelines.semidirect.pyramid import Grey, Pyramid
+from pipelines.semidirect.refinement import Observations, PoseOptions, RefinedPose
 from pipelines.semidirect.settings import SemidirectSettings
 from pipelines.semidirect.step import Feature
 
@@ -27,6 +27,7 @@ Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 
+MATCHED = int(Feature.MATCHED)
 EDGE_PX = 8
 """A point nearer to the border of the image is not looked for: its patch would reach out."""
 VIEWS_COUNTED = 1000
@@ -53,7 +54,7 @@ class Looked(NamedTuple):
     """The map points that were looked for in a frame: rows of the map [n], what came out, and `Feature`s [n]."""
 
     rows: Longs
-    features: features.Features
+    features: Features
     outcome: Longs
 
 
@@ -178,57 +179,91 @@ class Tracker:
         views = np.minimum(np.diff(seen.first)[rows], VIEWS_COUNTED - 1)
         worth = points.state[rows] * VIEWS_COUNTED + views
         order = np.argsort(self._turn[cell] * 4 * VIEWS_COUNTED - worth, kind="stable")
-        rows, cell = rows[order], cell[order]
-        frames, pixels, level, cosine = references_of(
-            points.place, rows, seen.first, seen.frame, seen.pixels, seen.level,
-            centres_of(keyframes.cam_t_world), centre_of(pose),
-        )  # fmt: skip
-        normal = np.zeros((len(rows), 3))
-        normal[:, 2] = 1.0
-        depth = depths_of(keyframes.cam_t_world, points.place, rows, frames)
-        references = References(frames, pixels, level, depth, normal, cosine)
-        between = relative(pose, keyframes.cam_t_world)
-        found = features.align_features(
-            keyframes.grey, frame, self.optics, between, references, cell, self.settings.max_features, self._features
+        rows, found = find_points(
+            keyframes.grey,
+            frame,
+            self.optics,
+            relative(pose, keyframes.cam_t_world),
+            keyframes.cam_t_world,
+            centres_of(keyframes.cam_t_world),
+            centre_of(pose),
+            points.place,
+            seen,
+            rows[order],
+            cell[order],
+            self.settings.max_features,
+            self._features,
         )
-        tried = found.outcome != Feature.NOT_TRIED
-        return Looked(rows[tried], features.Features(*(column[tried] for column in found)), found.outcome[tried])
+        return Looked(rows, found, found.outcome.copy())
 
 
 @compiled
-def references_of(
-    places: Floats,
-    rows: Longs,
-    first: Longs,
-    frame: Longs,
-    pixels: Floats,
-    level: Longs,
-    frame_centres: Floats,
+def find_points(
+    keyframes: Grey,
+    frame: Pyramid,
+    optics: Optics,
+    cur_T_key: Floats,
+    keys_t_world: Floats,
+    key_centres: Floats,
     centre: Floats,
-) -> tuple[Longs, Floats, Longs, Floats]:
-    """Of each point's views that from the nearest angle: keyframe, pixel, level, cosine of the angle."""
-    n = len(rows)
-    begin = np.empty(n + 1, np.int64)
-    begin[0] = 0
-    for i in range(n):
-        begin[i + 1] = begin[i] + first[rows[i] + 1] - first[rows[i]]
-    seen = np.empty(begin[n], np.int64)
-    for i in range(n):
-        for j in range(begin[i + 1] - begin[i]):
-            seen[begin[i] + j] = first[rows[i]] + j
-    views = nearest_views(places[rows], centre, begin, frame[seen], frame_centres)
-    chosen = seen[views.observation]
-    return frame[chosen], pixels[chosen], level[chosen], views.cosine
+    places: Floats,
+    seen: Observations,
+    rows: Longs,
+    cell: Longs,
+    wanted: int,
+    options: FeatureOptions,
+) -> tuple[Longs, Features]:
+    """Look for map points in a frame, one a cell, until enough are found.
 
+    Args:
+        keyframes: the buffers [k, size] of the keyframes' pyramids.
+        frame: where to look.
+        optics: the camera.
+        cur_T_key: transforms [k, 4, 4] from each keyframe to the frame, as known so far.
+        keys_t_world: the keyframes' poses [k, 4, 4].
+        key_centres: their cameras' centres [k, 3].
+        centre: that of the frame's camera [3].
+        places: the map's points [P, 3].
+        seen: who saw them.
+        rows: the points to look for, in this order [n].
+        cell: the cell [n] that each lies in; one that has a point is not tried again.
+        wanted: so many points are enough.
+        options: stop rules.
 
-@compiled
-def depths_of(cams_t_world: Floats, places: Floats, rows: Longs, frames: Longs) -> Floats:
-    """Z [n] of points in the axes of a keyframe each."""
-    found = np.empty(len(rows))
-    for i in range(len(rows)):
-        t, p = cams_t_world[frames[i]], places[rows[i]]
-        found[i] = t[2, 0] * p[0] + t[2, 1] * p[1] + t[2, 2] * p[2] + t[2, 3]
-    return found
+    Returns:
+        The rows that were tried and what came out.
+    """
+    n, facing = len(rows), np.array([0.0, 0.0, 1.0])
+    found, patch = no_features(n), np.empty((SIDE + 2, SIDE + 2))
+    taken = np.zeros(cell.max() + 1 if n else 0, np.bool_)
+    tried, count = np.empty(n, np.int64), 0
+    m = 0
+    for i in range(n):
+        if count == wanted:
+            break
+        if taken[cell[i]]:
+            continue
+        row = rows[i]
+        place = places[row]
+        j, cosine = nearest_view(place, centre, seen.first[row], seen.first[row + 1], seen.frame, key_centres)
+        k = seen.frame[j]
+        t = keys_t_world[k]
+        depth = t[2, 0] * place[0] + t[2, 1] * place[1] + t[2, 2] * place[2] + t[2, 3]
+        key = Pyramid(keyframes[k], frame.height, frame.width)
+        align_feature(
+            key, frame, optics, cur_T_key[k], seen.pixels[j], seen.level[j], depth, facing, cosine, options, patch,
+            found, m,
+        )  # fmt: skip
+        tried[m] = row
+        if found.outcome[m] == MATCHED:
+            taken[cell[i]] = True
+            count += 1
+        m += 1
+    return tried[:m].copy(), Features(
+        found.pixels[:m].copy(), found.predicted[:m].copy(), found.level[:m].copy(), found.outcome[:m].copy(),
+        found.mean_difference[:m].copy(), found.residual_rms[:m].copy(), found.iterations[:m].copy(),
+        found.affine[:m].copy(),
+    )  # fmt: skip
 
 
 @compiled
