@@ -4,6 +4,7 @@ A camera flies along x at 1.5 m over a plane, looking down; it starts, tracks, l
 number of points, filters and patches is another one in every frame, and now and then none.
 """
 
+import dataclasses
 import math
 from collections.abc import Iterator
 from typing import Any
@@ -12,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
+from pipelines.semidirect.baseline_step import BaselineStep
 from pipelines.semidirect.step import Feature, SemidirectStep, Stage
 from pipelines.verdict import Verdict
 
@@ -166,3 +168,24 @@ def _step(rng: np.random.Generator, frame: int, points: NDArray[np.float64], sca
         "stage_ms": np.full(5, np.nan),
     }
     return SemidirectStep(**numbers)
+
+
+def baseline_steps(number: int, *, seed: int = 5) -> Iterator[BaselineStep]:
+    """The same flight as the baseline tells it."""
+    rng = np.random.default_rng(seed)
+    own = {
+        "corners": 900,
+        "coarse_tried": 50,
+        "coarse_found": 40,
+        "coarse_position_m": np.zeros(3),
+        "bundle_keyframes": np.array([4, 0]),
+        "bundle_iterations": np.array([3, 0]),
+        "bundle_outliers": np.array([1, 0]),
+        "points_removed": 2,
+        "stage_ms": np.full(3, math.nan),
+    }
+    names = {field.name for field in dataclasses.fields(BaselineStep)}
+    for step in steps(number, seed=seed):
+        shared = {name: getattr(step, name) for name in names if name not in own and hasattr(step, name)}
+        more = {"score": rng.gamma(2, 50, len(step.point_id)), "bundle_cost": rng.uniform(0, 9, (2, 2))}
+        yield BaselineStep(**(shared | own | more))

@@ -8,9 +8,10 @@ import pytest
 from test_rrd import assert_same
 
 from pipelines.semidirect import depth_filter
+from pipelines.semidirect.baseline_step import BaselineStep
 from pipelines.semidirect.step import SemidirectStep
 from workbench import rrd, rrd_reading
-from workbench.schema import SCHEMAS, SEMIDIRECT, Archetype, quantities
+from workbench.schema import BASELINE, SCHEMAS, SEMIDIRECT, Archetype, quantities
 
 
 def logged(path: Path, number: int = 90, **more: bool) -> list[SemidirectStep]:
@@ -30,6 +31,18 @@ def test_every_field_reads_back_bit_for_bit(tmp_path: Path) -> None:
     read = rrd.read_steps(tmp_path / "run.rrd", "fast", SemidirectStep)
     assert len(read) == len(steps)
     for a, b in zip(steps, read, strict=True):
+        assert_same(a, b)
+
+
+def test_every_field_of_the_baseline_reads_back_bit_for_bit(tmp_path: Path) -> None:
+    steps = list(fake.baseline_steps(80))
+    with rrd.RunWriter(
+        tmp_path / "run.rrd", recording_id="m", run="b", estimator="ptam", step_type=BaselineStep, settings_text=""
+    ) as writer:
+        for step in steps:
+            writer.step(step)
+        writer.finish({}, None)
+    for a, b in zip(steps, rrd.read_steps(tmp_path / "run.rrd", "b", BaselineStep), strict=True):
         assert_same(a, b)
 
 
@@ -69,6 +82,7 @@ def test_the_filters_outcomes_are_called_as_they_are() -> None:
 
 
 def test_every_open_length_is_a_list() -> None:
-    for row in SEMIDIRECT.rows:
-        open_axes = any(isinstance(n, str) for n in SEMIDIRECT.shape(row.field))
-        assert open_axes == (row.archetype is Archetype.LISTS), row.field
+    for schema in (SEMIDIRECT, BASELINE):
+        for row in schema.rows:
+            open_axes = any(isinstance(n, str) for n in schema.shape(row.field))
+            assert open_axes == (row.archetype is Archetype.LISTS), row.field

@@ -374,6 +374,18 @@ _VISUAL_PLOTS: Mapping[str, Sequence[tuple[str, str]]] = {
     "Scale": (("Metres a unit of the first map", "scale/metres_per_unit"),),
     "Pose": (("Camera in the world", "pose/position"), ("Standard deviations", "pose/sigma")),
 }
+_BASELINE_PLOTS: Mapping[str, Sequence[tuple[str, str]]] = {
+    "Search": (
+        ("Corners of the frame", "tracking/corners"),
+        ("Coarse step: points tried and found", "tracking/coarse"),
+    ),
+    "Keyframes": (
+        ("Distance to the nearest keyframe / depth", "keyframe/distance"),
+        ("Points added and removed", "structure/changed"),
+        ("Bundle: cost, px²", "bundle/cost"),
+    ),
+    "Times": (("Time of the stages, ms", "work/stages"),),
+}
 _SEMIDIRECT_PLOTS: Mapping[str, Sequence[tuple[str, str]]] = {
     "Alignment": (
         ("Alignment cost, grey²", "alignment/level"),
@@ -413,7 +425,7 @@ def _visual_plots(root: str, frames: tuple[int, int] | None, *, semidirect: bool
             plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
         )
 
-    groups = {**_VISUAL_PLOTS, **(_SEMIDIRECT_PLOTS if semidirect else {})}
+    groups = {**_VISUAL_PLOTS, **(_SEMIDIRECT_PLOTS if semidirect else _BASELINE_PLOTS)}
     tabs: list[Any] = [
         rrb.Horizontal(*(plot(name, [entity]) for name, entity in plots), name=tab) for tab, plots in groups.items()
     ]

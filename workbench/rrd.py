@@ -29,6 +29,7 @@ from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
 from pipelines.geometry import heading_of_quat
 from pipelines.ranging.step import RangeStep
+from pipelines.semidirect.baseline_step import BaselineStep
 from pipelines.semidirect.step import SemidirectStep
 from pipelines.verdict import Severity, Verdict
 from readers.streams import ImageError, ImageSample, PoseSample, RecordingError, Sample
@@ -57,7 +58,7 @@ from workbench.rrd_reading import around, chunks, listed
 from workbench.rrd_reading import merge as merge
 from workbench.rrd_reading import recover as recover
 from workbench.rrd_samples import SampleLog, is_grey
-from workbench.rrd_semidirect import SemidirectDrawing
+from workbench.rrd_semidirect import SemidirectDrawing, VisualDrawing
 from workbench.schema import Archetype, Row, Schema, schema_of
 
 if TYPE_CHECKING:
@@ -75,6 +76,7 @@ _DRAWINGS: Mapping[type[Step], type[Drawing]] = {
     CorrelationStep: CorrelationDrawing,
     RangeStep: RangeDrawing,
     SemidirectStep: SemidirectDrawing,
+    BaselineStep: VisualDrawing,
 }
 
 

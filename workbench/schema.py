@@ -25,6 +25,7 @@ from numpy.typing import NDArray
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step, quantities
 from pipelines.ranging.step import RangeStep
+from pipelines.semidirect.baseline_step import BaselineStep
 from pipelines.semidirect.step import Feature, SemidirectStep
 from readers.streams import WorkbenchError
 
@@ -322,6 +323,7 @@ _TWIST = ("x", "y", "z", "rx", "ry", "rz")
 _FILTER_OUTCOMES = ("updated", "no match", "converged", "diverged", "unseen", "given up")
 """As `depth_filter.Outcome`, which comes with compiled code, and one more."""
 _STAGES = ("pyramid", "alignment", "features and pose", "start or search", "mapping")
+_BUNDLES = ("local", "global")
 _STATES = "points `/camera/image/RUN/{}`".format
 _MAP = "`/world/runs/RUN/map/{}`".format
 _LIST = Archetype.LISTS
@@ -433,10 +435,43 @@ SEMIDIRECT = Schema(
     ),
 )  # fmt: skip
 
+BASELINE = Schema(
+    BaselineStep,
+    (
+        *VISUAL,
+        Row("prior_position_m", "prior/position", axes=_XYZ, title="prior"),
+        Row("corners", "tracking/corners", title="corners"),
+        Row("coarse_tried", "tracking/coarse", title="tried"),
+        Row("coarse_found", "tracking/coarse", title="found"),
+        Row("coarse_position_m", "tracking/coarse_position", axes=_XYZ, title="coarse"),
+        Row("score", "features/points", _LIST),
+        Row("pose_scale_px", "tracking/scale", title="scale"),
+        Row("keyframe_distance", "keyframe/distance", title="distance / depth"),
+        Row("points_added", "structure/changed", title="added"),
+        Row("points_removed", "structure/changed", title="removed"),
+        Row("bundle_keyframes", "bundle/size", axes=_BUNDLES, title="keyframes"),
+        Row("bundle_iterations", "bundle/iterations", axes=_BUNDLES, title="iterations"),
+        Row("bundle_cost", "bundle/cost", axes=("local before", "local after", "global before", "global after"),
+            title="cost"),
+        Row("bundle_outliers", "bundle/outliers", axes=_BUNDLES, title="outliers"),
+        Row("start_matches", "start/matches", title="corners"),
+        Row("start_motion_px", "start/motion", title="motion"),
+        Row("start_parallax_px", "start/motion", title="parallax"),
+        Row("relocalise_keyframe", "relocalisation/keyframe", title="keyframe"),
+        Row("relocalise_correlation", "relocalisation/correlation", title="correlation"),
+        Row("stage_ms", "work/stages", axes=("pyramid and corners", "tracking", "mapping"), title="time of"),
+    ),
+)  # fmt: skip
+
 CLOCKED = frozenset({"stage_ms"})
 """Fields that the machine's clock tells: no replay repeats them."""
 
-SCHEMAS: Mapping[type[Step], Schema] = {CorrelationStep: CORRELATION, RangeStep: RANGE, SemidirectStep: SEMIDIRECT}
+SCHEMAS: Mapping[type[Step], Schema] = {
+    CorrelationStep: CORRELATION,
+    RangeStep: RANGE,
+    SemidirectStep: SEMIDIRECT,
+    BaselineStep: BASELINE,
+}
 
 
 def schema_of(step_type: type[Step]) -> Schema:

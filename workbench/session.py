@@ -369,7 +369,14 @@ def _choose_for_visual(request: Request, recording: Recording, resolved: Resolve
     reference = inputs.load_reference(recording, request.reference, start_ns, stop_ns, offset_ns)
     reference = inputs.overlapping(recording, reference, request.reference, image, first.t_ns, offset_ns)
     resolved, notes = visual_inputs.with_camera(resolved, recording, image, first.size_px)
-    resolved, source = visual_inputs.with_scale(resolved, recording, height=request.height, odometry=request.odometry)
+    resolved, source = visual_inputs.with_scale(
+        resolved,
+        recording,
+        kinds=plugin(request.estimator).build(resolved.settings).kinds,
+        height=request.height,
+        odometry=request.odometry,
+        start_ns=first.t_ns,
+    )
     resolved = inputs.with_start(resolved, reference, first.t_ns + offset_ns)
     account = VisualAccount(resolved.settings, reference, offset_ns, source)
     return _Chosen(

@@ -117,10 +117,23 @@ def _semidirect() -> Plugin:
     return Plugin("semidirect", SemidirectSettings, build, step=SemidirectStep)
 
 
+def _ptam() -> Plugin:
+    from pipelines.semidirect.baseline_settings import BaselineSettings
+    from pipelines.semidirect.baseline_step import BaselineStep
+
+    def build(settings: BaselineSettings) -> Estimator[Any]:
+        from pipelines.semidirect.baseline import BaselineOdometry
+
+        return BaselineOdometry(settings)
+
+    return Plugin("ptam", BaselineSettings, build, step=BaselineStep)
+
+
 BUILT_IN: Mapping[str, Callable[[], Plugin]] = {
     "correlation": _correlation,
     "range": _range,
     "semidirect": _semidirect,
+    "ptam": _ptam,
 }
 
 

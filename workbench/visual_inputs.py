@@ -7,6 +7,7 @@ reference is never taken for the scale unless the setting `position_stream` name
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -82,7 +83,13 @@ def _with_mounting(resolved: Resolved, camera: Camera | None, notes: list[str]) 
 
 
 def with_scale(
-    resolved: Resolved, recording: Recording, *, height: str | None = None, odometry: str | None = None
+    resolved: Resolved,
+    recording: Recording,
+    *,
+    kinds: Sequence[StreamKind],
+    height: str | None = None,
+    odometry: str | None = None,
+    start_ns: int | None = None,
 ) -> tuple[Resolved, ScaleSource]:
     """Complete the settings with the streams that tell the scale.
 
@@ -91,8 +98,10 @@ def with_scale(
     Args:
         resolved: the settings.
         recording: what there is.
+        kinds: what the estimator takes. One that takes images alone gets the first height of the window.
         height: stream of heights that the user named, or none; else the settings' own, else the only range stream.
         odometry: odometry whose speed the user wants to be the scale.
+        start_ns: when the window begins.
 
     Raises:
         StreamError: a stream is missing, or holds something else or nothing that tells a length.
@@ -106,6 +115,8 @@ def with_scale(
         chosen = "" if odometry == NONE else of_kind(recording, odometry, (StreamKind.ODOMETRY,), "--odometry")
         values["speed_stream"] = chosen
     resolved = filled(resolved, values)
+    if StreamKind.RANGE not in kinds:
+        return _with_first_height(resolved, recording, start_ns)
     settings = resolved.settings
     told: list[str] = []
     if settings.height_stream:
@@ -121,6 +132,23 @@ def with_scale(
         told.append(f"positions of {settings.position_stream}")
     streams = dict.fromkeys(s for s in (settings.height_stream, settings.speed_stream, settings.position_stream) if s)
     return resolved, ScaleSource(tuple(streams), ", else ".join(told))
+
+
+def _with_first_height(resolved: Resolved, recording: Recording, start_ns: int | None) -> tuple[Resolved, ScaleSource]:
+    """The scale of an estimator that takes images alone: a constant height, else the first one of the stream."""
+    settings: Any = resolved.settings
+    stream = settings.height_stream
+    unusable = settings.speed_stream or settings.position_stream
+    if unusable:
+        raise StreamError(f"{unusable} cannot be the scale: this estimator takes images and a height alone")
+    if not stream:
+        known = settings.height_m is not None
+        return resolved, ScaleSource((), f"height {settings.height_m:g} m at the start, as given" if known else "")
+    first = next((h for s in recording.read([stream], start_ns) if (h := height_of(s)) is not None), None)
+    if first is None:
+        raise StreamError(f"{recording.path}: {stream} holds no positive height: choose another with --height")
+    values = {"height_m": first + settings.height_offset_m, "height_stream": ""}
+    return filled(resolved, values), ScaleSource((), f"height of {stream} at the start")
 
 
 def _demand(recording: Recording, stream: str, what: str, tells: Any) -> None:
