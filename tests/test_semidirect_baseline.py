@@ -179,7 +179,8 @@ def test_a_fisheye_lens_is_flown_with() -> None:
 def test_without_a_height_the_unit_is_the_depth_of_the_first_map() -> None:
     steps = flown(odometry(height_m=None), flight()[0][:60])[1]
     with_height = usual()[59]
-    assert steps[-1].scale_known == 0 and np.isnan(steps[-1].metres_per_unit)
+    assert steps[-1].scale_known == 0
+    assert np.isnan(steps[-1].metres_per_unit)
     assert with_height.scale_known == 1
     assert with_height.position_m[2] == pytest.approx(with_height.metres_per_unit * steps[-1].position_m[2], rel=1e-2)
 
@@ -192,7 +193,9 @@ def test_blank_images_are_lost_and_the_way_goes_on_behind_them() -> None:
     dark = range(80, 92)
     _, steps = flown(odometry(), [blank(i) if i.frame in dark else i for i in images])
     for k in dark:
-        assert steps[k].stage == Stage.LOST and steps[k].verdict == Verdict.LOST and not steps[k].accepted
+        assert steps[k].stage == Stage.LOST
+        assert steps[k].verdict == Verdict.LOST
+        assert not steps[k].accepted
         np.testing.assert_array_equal(steps[k].position_m, steps[79].position_m)
         assert steps[k].path_step_m == 0
     found = next(k for k in range(92, len(steps)) if steps[k].accepted)
@@ -203,7 +206,7 @@ def test_blank_images_are_lost_and_the_way_goes_on_behind_them() -> None:
 
 def test_back_over_a_keyframe_the_camera_is_relocalised() -> None:
     """After the loss the images are those of the way back: the motion model is wrong, the keyframes are not."""
-    images, truth, _ = flight()
+    images, _truth, _ = flight()
     gap = images[100].t_ns - images[99].t_ns
     back = [
         sample(images[k].grey(), images[99].t_ns + (i + 11) * gap, 110 + i) for i, k in enumerate(range(70, 50, -1))
@@ -211,8 +214,11 @@ def test_back_over_a_keyframe_the_camera_is_relocalised() -> None:
     dark = [blank(sample(images[0].grey(), images[99].t_ns + (i + 1) * gap, 100 + i)) for i in range(10)]
     _, steps = flown(odometry(), [*images[:100], *dark, *back])
     first = next(s for s in steps[110:] if s.accepted)
-    assert first.stage == Stage.RELOCALISED and Verdict.REACQUIRED in first.alarms and first.relocalised_frames == 0
-    assert first.relocalise_correlation > 0.5 and first.relocalise_keyframe in range(40, 90)
+    assert first.stage == Stage.RELOCALISED
+    assert Verdict.REACQUIRED in first.alarms
+    assert first.relocalised_frames == 0
+    assert first.relocalise_correlation > 0.5
+    assert first.relocalise_keyframe in range(40, 90)
     assert steps[-1].relocalised_frames == len(steps) - 1 - steps.index(first)
     np.testing.assert_allclose(steps[-1].position_m, steps[51].position_m, atol=0.02)
 
@@ -224,7 +230,8 @@ def test_a_new_map_is_begun_when_lost_for_long() -> None:
     assert [steps[k].map_number for k in started] == [0, 1]
     assert all(Verdict.LOST in s.alarms and not s.accepted for s in steps[50 : started[1]])
     after = steps[started[1]]
-    assert after.scale_known == 0 and np.isnan(after.metres_per_unit)
+    assert after.scale_known == 0
+    assert np.isnan(after.metres_per_unit)
     assert min(after.map_id) > max(max(s.map_id, default=-1) for s in steps[: started[1]])
     assert after.position_m[2] == pytest.approx(ABOVE, abs=0.15)
     assert steps[-1].accepted
@@ -266,7 +273,9 @@ def test_frames_that_cannot_be_used_are_skipped() -> None:
         (again, Verdict.DUPLICATE_FRAME),
     ):
         after, step = estimator.step(state, one)
-        assert step.stage == Stage.SKIPPED and step.verdict == verdict and not step.accepted
+        assert step.stage == Stage.SKIPPED
+        assert step.verdict == verdict
+        assert not step.accepted
         np.testing.assert_array_equal(step.position_m, steps[-1].position_m)
         assert estimator.step(after, images[60])[1].accepted
     assert estimator.step(state, dataclasses.replace(broken, kind=StreamKind.IMU)) == (state, None)
@@ -318,7 +327,8 @@ def test_equal_input_gives_equal_steps_also_from_a_packed_state() -> None:
     state, steps = flown(estimator, images[:75])
     assert all(map(same, steps, usual()[:75]))
     packed = estimator.packed(state)
-    assert packed.map.buffers is None and all(isinstance(v, FrameImage) for v in (packed.view, *packed.map.views))
+    assert packed.map.buffers is None
+    assert all(isinstance(v, FrameImage) for v in (packed.view, *packed.map.views))
     again = estimator.unpacked(packed, lambda frame: images[frame].grey())
     for image in images[75:90]:
         again, step = estimator.step(again, image)
@@ -358,7 +368,8 @@ def test_the_table_holds_opencvs_corners_row_by_row() -> None:
         first = view.corners.first[level]
         mine = {(u, v) for v in range(HEIGHT) for u in view.corners.column[first[v] : first[v + 1]].tolist()}
         found = cv2.FastFeatureDetector.create(10, False).detect(image)
-        assert mine == {(int(k.pt[0]), int(k.pt[1])) for k in found} and len(mine) > 5
+        assert mine == {(int(k.pt[0]), int(k.pt[1])) for k in found}
+        assert len(mine) > 5
 
 
 def points_of(view):
@@ -383,14 +394,16 @@ def test_points_are_found_where_they_are_not_where_they_are_thought(align_level:
     )
     truth = lens.project(CAMERA, points @ pose[:3, :3].T + pose[:3, 3])
     got = match.outcome == Feature.MATCHED
-    assert np.count_nonzero(got) > 60 and np.mean(got) > 0.5
+    assert np.count_nonzero(got) > 60
+    assert np.mean(got) > 0.5
     np.testing.assert_allclose(
         match.predicted, lens.project(CAMERA, points @ guess[:3, :3].T + guess[:3, 3]), atol=1e-9
     )
     error = np.linalg.norm(match.found - truth, axis=1)[got] / 2.0 ** match.level[got]
     assert np.median(np.linalg.norm(match.predicted - truth, axis=1)) > 1.5
     assert np.median(error) < (0.1 if align_level == 0 else 0.8)
-    assert np.all(match.score[got] < OPTIONS.max_score) and np.all(np.isin(match.level[got], (1, 2, 3)))
+    assert np.all(match.score[got] < OPTIONS.max_score)
+    assert np.all(np.isin(match.level[got], (1, 2, 3)))
     outside = (truth < -20).any(1) | (truth > np.array([WIDTH + 20, HEIGHT + 20])).any(1)
     assert np.all(match.outcome[outside] == Feature.OUT_OF_VIEW)
 
@@ -421,7 +434,8 @@ def test_points_are_not_found_on_other_ground() -> None:
 def test_corners_keep_out_of_cells_that_are_taken() -> None:
     view, _ = plane_view()
     free = free_corners(view, *UNUSED, 12, 4.0)
-    assert set(free.level.tolist()) == {1, 2, 3} and np.all(free.score > 4.0)
+    assert set(free.level.tolist()) == {1, 2, 3}
+    assert np.all(free.score > 4.0)
     cells = {
         (int(k), *np.floor((p + 0.5) / (12 << k)).astype(int)) for p, k in zip(free.pixels, free.level, strict=True)
     }
@@ -473,7 +487,8 @@ def three_views():
 def test_a_map_stays_in_order_whatever_goes() -> None:
     m = three_views()
     n = len(m.points)
-    assert m.made == 100 + n and m.ids[0] == 100
+    assert m.made == 100 + n
+    assert m.ids[0] == 100
     np.testing.assert_array_equal(m.seen.keyframe, np.tile([0, 1, 2], n))
     gone = np.arange(n) % 3 == 0
     less = baseline_map.without(m, points=gone, keyframe=0)
@@ -495,7 +510,8 @@ def test_the_local_bundle_puts_a_keyframe_back_and_throws_a_wrong_match_out() ->
     pixels[wrong] += 30
     bent = dataclasses.replace(m, poses=poses, seen=m.seen._replace(pixels=pixels))
     done = baseline_map.local_bundle(bent, optics_of(CAMERA), 5, BundleOptions(20))
-    assert done.outliers == 1 and done.bundle is not None
+    assert done.outliers == 1
+    assert done.bundle is not None
     np.testing.assert_allclose(done.map.poses[2], m.poses[2], atol=1e-3)
     np.testing.assert_array_equal(done.map.poses[:2], m.poses[:2])
     assert len(done.map.seen.point) == len(m.seen.point) - 1

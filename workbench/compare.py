@@ -184,7 +184,7 @@ def _first_different(first: Run, run: Run, i: Ints, j: Ints) -> tuple[int, str]:
         if not earliest:
             break
     for field in (field for field in first.lists if field in run.lists):
-        lists, others = first.list_column(field), run.list_column(field)
+        lists, others = first.column(field), run.column(field)
         row = _first_unequal(lists, others, i[:earliest], j[:earliest])
         if row >= 0:
             earliest, name = row, field

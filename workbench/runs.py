@@ -180,7 +180,7 @@ class Run:
         return self.schema.lists
 
     def columns(self, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-        """Some fields of all frames, [n, *shape] each; lists are not for it, see `list_column`.
+        """Some fields of all frames, [n, *shape] each; lists are not for it, see `column`.
 
         Raises:
             RecordingError: the file cannot be read, or holds no such run.
@@ -211,8 +211,17 @@ class Run:
         return rrd_reading.columns(self.file, self.root, self.schema, self.fields, choose)
 
     def column(self, name: str) -> NDArray[Any]:
-        """One field of all frames, [n, *shape]; see `columns`."""
-        return self.columns([name])[name]
+        """One field of all frames, [n, *shape], see `columns`; of a list an array [n] of arrays, which is not kept.
+
+        Raises:
+            RecordingError: the file cannot be read.
+            KeyError: there is no such field.
+        """
+        if name not in self.lists:
+            return self.columns([name])[name]
+        from workbench import rrd_reading
+
+        return rrd_reading.columns(self.file, self.root, self.schema, [name])[name]
 
     @property
     def frames(self) -> Ints:
@@ -287,16 +296,6 @@ class Run:
             return {}
         found = read_fields(self.file, self.name, self.step_type, self.lists, range(frame, frame + 1))
         return {name: values[0] for name, values in found.items()}
-
-    def list_column(self, name: str) -> NDArray[Any]:
-        """One list of all frames, an array [n] of arrays; it is large and not kept.
-
-        Raises:
-            RecordingError: the file cannot be read.
-        """
-        from workbench import rrd_reading
-
-        return rrd_reading.columns(self.file, self.root, self.schema, [name])[name]
 
     def steps(self, first: int, stop: int) -> list[Step]:
         """The Steps of the frames `first` to before `stop`, surfaces included.

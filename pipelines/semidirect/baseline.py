@@ -543,7 +543,7 @@ class BaselineOdometry:
 
 
 def followed(trail: Trail, view: View) -> Trail:
-    """The trail in the next frame: each corner is compared with the first view, from where it was last (Lucas-Kanade)."""
+    """The trail in the next frame: each corner of the first view, sought from where it was last (Lucas-Kanade)."""
     if not len(trail.now_px):
         return trail
     first, image = level_image(trail.view.pyramid, 0), level_image(view.pyramid, 0)

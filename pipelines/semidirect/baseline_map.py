@@ -64,7 +64,7 @@ class Map:
     @property
     def first(self) -> Longs:
         """Where each point's observations begin [n + 1]."""
-        return np.searchsorted(self.seen.point, np.arange(len(self.points) + 1))
+        return np.append(0, np.cumsum(np.bincount(self.seen.point, minlength=len(self.points))))
 
     @property
     def observations(self) -> Observations:
@@ -130,7 +130,7 @@ def with_points(m: Map, points: Floats, seen: Seen) -> Map:
 
 
 def without(m: Map, *, points: Flags | None = None, seen: Flags | None = None, keyframe: int = -1) -> Map:
-    """The map less some points [n], observations [m] and a keyframe, and less the points that are left with one view."""
+    """The map less some points [n], observations [m] and a keyframe, and less points that are left with one view."""
     stays = np.ones(len(m.seen.point), np.bool_) if seen is None else ~seen
     if points is not None:
         stays &= ~points[m.seen.point]
@@ -239,7 +239,7 @@ class Adjusted(NamedTuple):
 
 
 def local_bundle(m: Map, optics: Optics, moving: int, options: BundleOptions) -> Adjusted:
-    """The newest keyframe and those nearest to it move with all points that they see; the others that see these hold."""
+    """The newest keyframe and those nearest to it move with the points that they see; others that see these hold."""
     free = np.zeros(len(m.frames), np.bool_)
     free[m.nearest(se3_inverse(m.poses[-1])[:3, 3])[:moving]] = True
     return _adjusted(m, optics, free & ~oldest_fixed(len(free)), options)
