@@ -16,7 +16,7 @@ from pipelines.geometry import wrap_angles
 from readers.streams import RecordingError, WorkbenchError
 from workbench.metrics import metrics
 from workbench.runs import Run
-from workbench.schema import CLOCKED
+from workbench.schema import CLOCKED, Archetype
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -171,6 +171,8 @@ def parting(first: Run, run: Run) -> Parting:
 def _first_different(first: Run, run: Run, i: Ints, j: Ints) -> tuple[int, str]:
     """The first common row at which any number differs, and a field that does; -1 where none does."""
     earliest, name = len(i), ""
+    for one in (first, run):
+        one.columns(one.fields)  # in one pass over the file
     for field in first.fields:
         if field not in run.fields or field in CLOCKED:
             continue
@@ -183,11 +185,13 @@ def _first_different(first: Run, run: Run, i: Ints, j: Ints) -> tuple[int, str]:
             earliest, name = int(rows[0]), field
         if not earliest:
             break
-    for field in (field for field in first.lists if field in run.lists):
-        lists, others = first.column(field), run.column(field)
-        row = _first_unequal(lists, others, i[:earliest], j[:earliest])
-        if row >= 0:
-            earliest, name = row, field
+    for rows in first.schema.of(Archetype.LISTS).values():
+        names = [row.field for row in rows if row.field in run.lists]
+        lists, others = first.list_columns(names), run.list_columns(names)
+        for field in names:
+            row = _first_unequal(lists[field], others[field], i[:earliest], j[:earliest])
+            if row >= 0:
+                earliest, name = row, field
     return (earliest, name) if name else (-1, "")
 
 

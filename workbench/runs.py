@@ -217,11 +217,17 @@ class Run:
             RecordingError: the file cannot be read.
             KeyError: there is no such field.
         """
-        if name not in self.lists:
-            return self.columns([name])[name]
+        return self.list_columns([name])[name] if name in self.lists else self.columns([name])[name]
+
+    def list_columns(self, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+        """Some lists of all frames, an array [n] of arrays each; they are large and not kept.
+
+        Raises:
+            RecordingError: the file cannot be read.
+        """
         from workbench import rrd_reading
 
-        return rrd_reading.columns(self.file, self.root, self.schema, [name])[name]
+        return rrd_reading.columns(self.file, self.root, self.schema, names)
 
     @property
     def frames(self) -> Ints:

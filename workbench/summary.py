@@ -392,7 +392,10 @@ def _visual_lines(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     sizes = f"rmse {ape['rmse']:.4g} m ({space['ape_percent']:.3g} % of {space['reference_path_m']:.4g} m)"
     drift = space["scale_drift_percent"]
     drifted = "" if math.isnan(drift) else f", which changes by {drift:.3g} % from the first third to the last"
-    rows.append(("in space", f"{sizes}, max {ape['max']:.4g} m after Sim(3); scale {space['scale']:.5g}{drifted}"))
+    of_map = f"map {space['of_map']} alone: " if "of_map" in space else ""
+    rows.append(
+        ("in space", f"{of_map}{sizes}, max {ape['max']:.4g} m after Sim(3); scale {space['scale']:.5g}{drifted}")
+    )
     if "ape_without_scale_m" in space:
         rows.append(("in space", f"rmse {space['ape_without_scale_m']['rmse']:.4g} m after SE(3)"))
     rows.append(

@@ -65,6 +65,7 @@ class _Track:
     place: array[float] = field(default_factory=lambda: array("d"))
     pose: array[float] = field(default_factory=lambda: array("d"))
     known: array[int] = field(default_factory=lambda: array("b"))
+    map: array[int] = field(default_factory=lambda: array("q"))
 
     def add(self, step: VisualStep) -> None:
         self.frame.append(step.frame)
@@ -72,6 +73,7 @@ class _Track:
         self.place.extend([*step.position_m.tolist(), *step.quat_xyzw.tolist()])
         self.pose.extend(step.pose.tolist())
         self.known.append(step.scale_known)
+        self.map.append(step.map_number)
 
 
 class VisualAccount:
@@ -191,16 +193,24 @@ class VisualAccount:
         return result, sentence
 
     def _in_space(self, kept: NDArray[np.int64], unit: str) -> tuple[dict[str, Any] | None, Floats | None]:
-        """The path in space against the reference; and the reference [n, 3] laid over the path."""
-        if not self._reference.poses:
+        """The path in space against the reference; and the reference [n, 3] laid over the path.
+
+        Of several maps only the one with the most frames, as each has a place and a scale of its own.
+        """
+        if not self._reference.poses or not len(kept):
             return None, None
+        maps = self._column("map")[kept]
+        numbers, counts = np.unique(maps, return_counts=True)
+        largest = int(numbers[np.argmax(counts)])
+        kept = kept[maps == largest]
         place = self._column("place").reshape(-1, 7)[kept]
         estimate = SpatialPath.of(self._column("t_ns")[kept].astype(np.int64), place[:, :3], place[:, 3:])
         reference = SpatialPath.of_poses(self._reference.poses)
         if not len(reference):
             return {"sentence": f"not compared in space: {self._reference.stream} has no attitude"}, None
         try:
-            return in_space(estimate, reference, offset_ns=self._offset_ns, with_scale=unit != METRES)
+            values, laid = in_space(estimate, reference, offset_ns=self._offset_ns, with_scale=unit != METRES)
+            return values | ({"of_map": largest} if len(numbers) > 1 else {}), laid
         except (ValueError, EvaluationError) as error:
             return {"sentence": f"not compared in space: {error}"}, None
 

@@ -389,6 +389,8 @@ def _size(values: Sequence[Any]) -> float:
 def _change(name: str, old: Any, new: Any, usual: float) -> Change | None:
     """The largest difference in a field, None where all its bits are equal."""
     a, b = (np.ascontiguousarray(value, np.float64) for value in (old, new))
+    if a.shape[1:] == b.shape[1:] and len(a) != len(b):
+        return Change(f"{name}: length", float(len(a)), float(len(b)), abs(len(a) - len(b)) / max(len(a), len(b)))
     if a.shape != b.shape:
         return Change(f"{name}: shape", float(a.size), float(b.size), math.inf)
     if a.tobytes() == b.tobytes():

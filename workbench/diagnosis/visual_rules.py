@@ -231,10 +231,10 @@ def _find_losses(cause: Cause, case: Case, rule: Rule) -> Iterable[Finding]:
         rows[loss.first : loss.stop] = True
     longest = max(losses, key=lambda loss: loss.stop - loss.first)
     seconds = float(case.t_ns[longest.stop - 1] - case.t_ns[longest.first]) / 1e9
-    often = "once" if len(losses) == 1 else f"{len(losses)} times"
+    often = _times(len(losses))
     yield _finding(
         case, rule, rows, longest.first,
-        f"Lost {often}, for {int(rows.sum())} frames in all, at the longest from frame {case.frame[longest.first]} on "
+        f"Lost {often}, for {_frames(rows)} in all, at the longest from frame {case.frame[longest.first]} on "
         f"for {seconds:.3g} s; the last pose is held there.",
         cause.evidence(signals, longest.first, cause.thresholds),
     )  # fmt: skip
@@ -253,6 +253,15 @@ def _finding(case: Case, rule: Rule, rows: Bools, worst: int, sentence: str, evi
     )
 
 
+def _frames(rows: Bools) -> str:
+    count = int(rows.sum())
+    return "1 frame" if count == 1 else f"{count} frames"
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
 # --------------------------------------------------------------------- start, found again, new map
 
 
@@ -267,7 +276,7 @@ def _start_failed(case: Case, rule: Rule) -> Iterable[Finding]:
     bound = float(case.settings.get("start_motion_px", math.nan))
     yield _finding(
         case, rule, starting, worst,
-        f"No map was ever started: corners were followed in {int(starting.sum())} frames and moved "
+        f"No map was ever started: corners were followed in {_frames(starting)} and moved "
         f"{max(float(known[worst]), 0.0):.3g} px at the most.",
         (
             Evidence(name="start_motion_px", value=float(known[worst]), unit="px", bound=bound),
@@ -278,17 +287,17 @@ def _start_failed(case: Case, rule: Rule) -> Iterable[Finding]:
 
 def _after_relocalisation(case: Case, rule: Rule) -> Iterable[Finding]:
     signals = case.once(Signals)
-    since = np.asarray(case["relocalised_frames"], np.int64)
-    doubtful = (since >= 0) & signals.accepted
-    if not doubtful.any():
-        return
     again = np.flatnonzero(signals.stage == Stage.RELOCALISED)
-    worst = int(again[0]) if len(again) else int(np.argmax(doubtful))
+    if not len(again):
+        return
+    worst = int(again[0])
+    since = np.asarray(case["relocalised_frames"], np.int64)
+    doubtful = (since >= 0) & signals.accepted & (np.arange(len(since)) >= worst)
     correlation = np.asarray(case["relocalise_correlation"], np.float64)
     yield _finding(
         case, rule, doubtful, worst,
-        f"Found again {len(again)} times (frame {', '.join(str(f) for f in case.frame[again][:4])}); the "
-        f"{int(doubtful.sum())} frames that follow hang on one keyframe that looked alike.",
+        f"Found again {_times(len(again))} (frame {', '.join(str(f) for f in case.frame[again][:4])}); the "
+        f"{_frames(doubtful)} that follow hang on one keyframe that looked alike.",
         (
             Evidence(name="relocalise_correlation", value=float(correlation[worst]),
                      bound=float(case.settings.get("relocalise_correlation", math.nan))),
@@ -318,10 +327,9 @@ def _scale_unknown(case: Case, rule: Rule) -> Iterable[Finding]:
     signals = case.once(Signals)
     unknown = signals.accepted & (np.asarray(case["scale_known"], np.int64) == 0)
     if unknown.any():
-        count = int(unknown.sum())
         yield _finding(
             case, rule, unknown, int(np.argmax(unknown)),
-            f"Nothing told the scale in {count} frames: their lengths are in units of the first map.", (),
+            f"Nothing told the scale in {_frames(unknown)}: their lengths are in units of the first map.", (),
         )  # fmt: skip
 
 
@@ -340,7 +348,7 @@ def _height_drift(case: Case, rule: Rule) -> Iterable[Finding]:
     yield _finding(
         case, rule, drifted, worst,
         f"The height over the map is off the sensor's by {100 * off[worst]:+.3g} % at the most, by more than "
-        f"{100 * bound:g} % in {int(drifted.sum())} frames.",
+        f"{100 * bound:g} % in {_frames(drifted)}.",
         (Evidence(name="map height / sensor's - 1", value=float(off[worst]), usual=float(np.nanmedian(off)),
                   bound=bound),),
     )  # fmt: skip
@@ -386,7 +394,7 @@ def _ringing(flags: Verdict, what: str, case: Case, rule: Rule) -> Iterable[Find
         dt = np.asarray(case["dt_s"], np.float64)
         worst = int(np.argmax(np.where(rows, np.nan_to_num(dt), -1)))
         evidence = Evidence(name="dt_s", value=float(dt[worst]), unit="s", usual=signals.usual_dt())
-        yield _finding(case, rule, rows, worst, f"{what} at {int(rows.sum())} frames.", (evidence,))
+        yield _finding(case, rule, rows, worst, f"{what} at {_frames(rows)}.", (evidence,))
 
 
 def _few_points(case: Case, rule: Rule) -> Iterable[Finding]:
@@ -402,7 +410,7 @@ def _few_points(case: Case, rule: Rule) -> Iterable[Finding]:
     usual = float(np.median(signals.tracked[signals.accepted]))
     yield _finding(
         case, rule, rows, worst,
-        f"{int(rows.sum())} frames had fewer than {bound:.0f} points, the least {signals.tracked[worst]:.0f}; below "
+        f"{_frames(rows)} had fewer than {bound:.0f} points, the least {signals.tracked[worst]:.0f}; below "
         f"{least} the camera is lost.",
         (Evidence(name="tracked", value=float(signals.tracked[worst]), usual=usual, bound=bound),),
     )  # fmt: skip
@@ -424,7 +432,7 @@ def _drift(case: Case, rule: Rule) -> Iterable[Finding]:
     worst = int(order[0])
     yield _finding(
         case, rule, rows, worst,
-        f"{enough} frames make half of the error at the end, which is {100 * total / length:.3g} % of the path.",
+        f"Half of the error at the end, which is {100 * total / length:.3g} % of the path, comes of {_frames(rows)}.",
         (Evidence(name="harm", value=float(harm[worst]), unit="m", usual=float(np.nanmedian(case.harm_m))),),
     )  # fmt: skip
 
