@@ -185,8 +185,8 @@ def _first_different(first: Run, run: Run, i: Ints, j: Ints) -> tuple[int, str]:
             earliest, name = int(rows[0]), field
         if not earliest:
             break
-    for rows in first.schema.of(Archetype.LISTS).values():
-        names = [row.field for row in rows if row.field in run.lists]
+    for group in first.schema.of(Archetype.LISTS).values():
+        names = [one.field for one in group if one.field in run.lists]
         lists, others = first.list_columns(names), run.list_columns(names)
         for field in names:
             row = _first_unequal(lists[field], others[field], i[:earliest], j[:earliest])

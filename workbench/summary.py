@@ -377,10 +377,11 @@ def _visual_lines(found: Mapping[str, Any]) -> list[tuple[str, str]]:
     rows = [
         ("map", f"{found['keyframes']} keyframes ({found['keyframes_made']} made), {found['map_points']} points at the "
                 f"end; started at frame {starts}; {found['maps']} in all"),
-        ("tracked", f"median {found['tracked_median']:.0f} points a frame, at least {found['tracked_least']}"),
+        ("tracked", f"median {found['tracked_median']:.0f} points a frame, at least {found['tracked_least']}"
+                    if found["frames_with_pose"] else "no frame has a pose"),
         ("lost", f"{losses}{more}; found again: {again}"),
     ]  # fmt: skip
-    if found["frames_without_scale"]:
+    if 0 < found["frames_without_scale"] < found["frames_with_pose"]:
         told = f"{found['frames_without_scale']} frames before the scale was known are not compared"
         rows.append(("scale", told))
     space = found["space"]

@@ -156,15 +156,21 @@ class VisualAccount:
         return METRES, f"{self._source.sentence or 'as the estimator says'}{value}"
 
     def _kept(self, unit: str) -> NDArray[np.int64]:
-        """The rows of the track that are in the path's unit."""
+        """The rows of the track that are in the path's unit, which without a known scale is each map's own."""
         known = self._column("known").astype(bool)
-        return np.flatnonzero(known if unit == METRES else ~known)
+        rows = np.flatnonzero(known if unit == METRES else ~known)
+        return rows if unit == METRES else self._largest(rows)
+
+    def _largest(self, rows: NDArray[np.int64]) -> NDArray[np.int64]:
+        """Those of some rows that are of the map with the most of them."""
+        numbers, counts = np.unique(self._column("map")[rows], return_counts=True)
+        return rows[self._column("map")[rows] == numbers[np.argmax(counts)]] if len(rows) else rows
 
     def _odometry(self, kept: NDArray[np.int64]) -> dict[str, Any]:
         last = self._last
         return {
             "frames_with_pose": len(self._track.frame),
-            "frames_without_scale": len(self._track.frame) - len(kept) if self._column("known").any() else 0,
+            "frames_without_scale": int((self._column("known") == 0).sum()),
             "starts": self._starts,
             "losses": [list(span) for span in self._losses],
             "lost_frames": sum(b - a + 1 for a, b in self._losses),
@@ -184,6 +190,8 @@ class VisualAccount:
         sentence = self._reference.sentence
         if not self._reference.poses:
             return None, sentence
+        if unit != METRES and self._last is not None and self._last.map_number > 0:
+            sentence += "; the map with the most frames alone, as each has a unit of its own"
         pose = self._column("pose").reshape(-1, 3)[kept]
         estimate = Trajectory(self._column("t_ns")[kept].astype(np.int64), pose)
         try:
@@ -199,10 +207,7 @@ class VisualAccount:
         """
         if not self._reference.poses or not len(kept):
             return None, None
-        maps = self._column("map")[kept]
-        numbers, counts = np.unique(maps, return_counts=True)
-        largest = int(numbers[np.argmax(counts)])
-        kept = kept[maps == largest]
+        kept = self._largest(kept)
         place = self._column("place").reshape(-1, 7)[kept]
         estimate = SpatialPath.of(self._column("t_ns")[kept].astype(np.int64), place[:, :3], place[:, 3:])
         reference = SpatialPath.of_poses(self._reference.poses)
@@ -210,7 +215,12 @@ class VisualAccount:
             return {"sentence": f"not compared in space: {self._reference.stream} has no attitude"}, None
         try:
             values, laid = in_space(estimate, reference, offset_ns=self._offset_ns, with_scale=unit != METRES)
-            return values | ({"of_map": largest} if len(numbers) > 1 else {}), laid
+            alone = (
+                {"of_map": int(self._column("map")[kept[0]])}
+                if self._last is not None and self._last.map_number
+                else {}
+            )
+            return values | alone, laid
         except (ValueError, EvaluationError) as error:
             return {"sentence": f"not compared in space: {error}"}, None
 
