@@ -370,6 +370,14 @@ VISUAL: tuple[Row, ...] = (
     Row("map_point_views", "map/points", _LIST),
 )
 
+_BEGINNINGS: tuple[Row, ...] = (
+    Row("start_matches", "start/matches", title="corners"),
+    Row("start_motion_px", "start/motion", title="motion"),
+    Row("start_parallax_px", "start/motion", title="parallax"),
+    Row("relocalise_keyframe", "relocalisation/keyframe", title="keyframe"),
+    Row("relocalise_correlation", "relocalisation/correlation", title="correlation"),
+)
+
 SEMIDIRECT = Schema(
     SemidirectStep,
     (
@@ -424,11 +432,7 @@ SEMIDIRECT = Schema(
         Row("filter_inlier", "filters/each", _LIST, also="`filters/shown/K/ratio`"),
         Row("epipolar_px", "filters/each", _LIST, also="segments `/camera/image/RUN/epipolar`"),
         Row("filter_found_px", "filters/each", _LIST, also=_STATES("filters")),
-        Row("start_matches", "start/matches", title="corners"),
-        Row("start_motion_px", "start/motion", title="motion"),
-        Row("start_parallax_px", "start/motion", title="parallax"),
-        Row("relocalise_keyframe", "relocalisation/keyframe", title="keyframe"),
-        Row("relocalise_correlation", "relocalisation/correlation", title="correlation"),
+        *_BEGINNINGS,
         Row("height_m", "scale/height", title="sensor", also=_TABLE),
         Row("map_height_m", "scale/height", title="map", also=_TABLE),
         Row("stage_ms", "work/stages", axes=_STAGES, title="time of"),
@@ -454,11 +458,7 @@ BASELINE = Schema(
         Row("bundle_cost", "bundle/cost", axes=("local before", "local after", "global before", "global after"),
             title="cost"),
         Row("bundle_outliers", "bundle/outliers", axes=_BUNDLES, title="outliers"),
-        Row("start_matches", "start/matches", title="corners"),
-        Row("start_motion_px", "start/motion", title="motion"),
-        Row("start_parallax_px", "start/motion", title="parallax"),
-        Row("relocalise_keyframe", "relocalisation/keyframe", title="keyframe"),
-        Row("relocalise_correlation", "relocalisation/correlation", title="correlation"),
+        *_BEGINNINGS,
         Row("stage_ms", "work/stages", axes=("pyramid and corners", "tracking", "mapping"), title="time of"),
     ),
 )  # fmt: skip

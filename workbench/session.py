@@ -329,14 +329,31 @@ class _Chosen:
     smoothing: Smoothing | None = None
 
 
-def _choose_for_path(request: Request, recording: Recording, resolved: Resolved) -> _Chosen:
-    """The choices of an estimator of the vehicle's path: images, height, scale, start."""
+class _Footage(NamedTuple):
+    """Images of a path: their stream, the window, the first one, and the reference with its offset."""
+
+    image: str
+    start_ns: int | None
+    stop_ns: int | None
+    first: inputs.FirstFrame
+    reference: inputs.Reference
+    offset_ns: int
+
+
+def _footage(request: Request, recording: Recording) -> _Footage:
+    """The images and the reference of a path."""
     image = inputs.choose_images(recording, request.image)
     start_ns, stop_ns = _window(request, recording, image)
     first = inputs.first_frame(recording, image, start_ns, stop_ns)
     offset_ns = _offset_ns(request)
     reference = inputs.load_reference(recording, request.reference, start_ns, stop_ns, offset_ns)
     reference = inputs.overlapping(recording, reference, request.reference, image, first.t_ns, offset_ns)
+    return _Footage(image, start_ns, stop_ns, first, reference, offset_ns)
+
+
+def _choose_for_path(request: Request, recording: Recording, resolved: Resolved) -> _Chosen:
+    """The choices of an estimator of the vehicle's path: images, height, scale, start."""
+    image, start_ns, stop_ns, first, reference, offset_ns = _footage(request, recording)
     if request.calibrate and not reference.poses:
         raise StreamError(f"{request.path}: --calibrate needs a reference, but there is {reference.sentence}")
     height = inputs.choose_height(recording, request.height)
@@ -362,12 +379,7 @@ def _choose_for_visual(request: Request, recording: Recording, resolved: Resolve
     """The choices of a visual odometry with a map: images, camera, what tells the scale, start."""
     if request.calibrate:
         raise SettingsError("--calibrate is for correlation: a camera of visual odometry is calibrated with a board")
-    image = inputs.choose_images(recording, request.image)
-    start_ns, stop_ns = _window(request, recording, image)
-    first = inputs.first_frame(recording, image, start_ns, stop_ns)
-    offset_ns = _offset_ns(request)
-    reference = inputs.load_reference(recording, request.reference, start_ns, stop_ns, offset_ns)
-    reference = inputs.overlapping(recording, reference, request.reference, image, first.t_ns, offset_ns)
+    image, start_ns, stop_ns, first, reference, offset_ns = _footage(request, recording)
     resolved, notes = visual_inputs.with_camera(resolved, recording, image, first.size_px)
     resolved, source = visual_inputs.with_scale(
         resolved,
