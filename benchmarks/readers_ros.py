@@ -11,6 +11,8 @@ Bars: ROS 1 raw at most 0.5 x rosbags, uncompressed and lz4; the database's IMU 
 from __future__ import annotations
 
 import argparse
+import contextlib
+import sqlite3
 import sys
 import tempfile
 import time
@@ -115,6 +117,13 @@ def theirs(path: Path, topics: list[str] | None, window: tuple[int, int] | None)
         return sum(1 for _ in reader.messages(connections, start, stop))
 
 
+def sqlite_alone(path: Path, topic: str) -> int:
+    """The rows of a topic in the order of time, fetched by Python's sqlite3, and nothing done with them."""
+    query = "SELECT timestamp, data FROM messages WHERE topic_id = (SELECT id FROM topics WHERE name = ?) ORDER BY 1"
+    with contextlib.closing(sqlite3.connect(next(path.glob("*.db3")))) as database:
+        return sum(1 for _ in database.execute(query, (topic,)))
+
+
 def ours_decoded(path: Path, topics: list[str] | None, window: tuple[int, int] | None) -> int:
     """Samples in the order of their stamps."""
     start, stop = window or (None, None)
@@ -193,6 +202,10 @@ def main() -> None:
             bar = BARS.get(name)
             missed += bar is not None and own_s / peer_s > bar
             print(f"{name:24}{own_s * 1e3:10.1f}{peer_s * 1e3:12.1f}{own_s / peer_s:8.3f}{bar or '':>6}")
+        alone_s, rows = least(lambda: sqlite_alone(paths["db3"], "/imu"), given.passes)
+        print(
+            f"db3 /imu, fetching its {rows} rows alone: {alone_s * 1e3:.1f} ms, which no reader through SQLite is below"
+        )
         for form, path in paths.items():
             extra = extra_memory(path)
             missed += extra > MEMORY_BAR_MIB

@@ -36,7 +36,7 @@ from pipelines.evaluation import (
     motions,
     path_lengths,
 )
-from pipelines.geometry import rotated, wrap_angles
+from pipelines.planar import rotated, wrap_angles
 
 Integers = NDArray[np.int64]
 Order = Literal["harm", "size"]

@@ -22,7 +22,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.consistency import nees_of
-from pipelines.geometry import heading_of_quat, rotated, wrap_angle, wrap_angles
+from pipelines.planar import heading_of_quat, rotated, wrap_angle, wrap_angles
 from readers.streams import PoseSample, WorkbenchError
 
 Floats = NDArray[np.float64]

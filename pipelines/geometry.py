@@ -8,39 +8,14 @@ from __future__ import annotations
 import math
 
 import numpy as np
-from numpy.typing import NDArray
 
 from pipelines.compiled import compiled
+from pipelines.planar import Floats, heading_of_quat, quat_of_heading, rotated, wrap_angle, wrap_angles
 
-Floats = NDArray[np.float64]
-
-
-def wrap_angle(angle_rad: float) -> float:
-    """The same angle within [-π, π)."""
-    return (angle_rad + math.pi) % (2 * math.pi) - math.pi
-
-
-def wrap_angles(angles_rad: Floats) -> Floats:
-    """The same angles within [-π, π), of any shape; NaN stays NaN."""
-    return (angles_rad + np.pi) % (2 * np.pi) - np.pi
-
-
-def rotated(vectors: Floats, angle_rad: Floats) -> Floats:
-    """Plane vectors [n, 2], each turned counter-clockwise by its angle [n]."""
-    c, s = np.cos(angle_rad), np.sin(angle_rad)
-    x, y = vectors.T
-    return np.column_stack([c * x - s * y, s * x + c * y])
-
-
-def heading_of_quat(quat_xyzw: Floats) -> float:
-    """Heading (rotation about z, counter-clockwise) of a unit quaternion [4]; NaN stays NaN."""
-    x, y, z, w = (float(q) for q in quat_xyzw)
-    return math.atan2(2 * (w * z + x * y), 1 - 2 * (y * y + z * z))
-
-
-def quat_of_heading(heading_rad: float) -> Floats:
-    """The unit quaternion x, y, z, w [4] of a rotation about z."""
-    return np.array([0.0, 0.0, math.sin(heading_rad / 2), math.cos(heading_rad / 2)])
+__all__ = [
+    "Floats", "earth_centred", "from_local_enu", "geodetic", "hat", "heading_of_quat", "local_enu", "quat_of_heading",
+    "rotated", "se3_exp", "se3_inverse", "se3_log", "se3_product", "so3_exp", "so3_log", "wrap_angle", "wrap_angles",
+]  # fmt: skip
 
 
 WGS84_MAJOR_M = 6_378_137.0

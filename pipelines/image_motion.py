@@ -1,8 +1,9 @@
 """Motion of a whole image from one frame to the next, quickly: enough to compare clocks, not to navigate by.
 
-Corners of the first image are followed into the second one (pyramidal Lucas-Kanade) and a similarity is fitted to
-them without the outliers. Its turn is that about the optical axis, a downward camera's heading; its shift at the image
-centre is, over the focal length, the turn of a forward camera, and the way of a downward one.
+Corners of the first image are followed into the second one (pyramidal Lucas-Kanade) and a homography is fitted to
+them without the outliers: so a plane moves, however it is seen, and everything in a turn of the camera. Its turn at the
+image centre is that about the optical axis, a downward camera's heading; its shift there is, over the focal length, the
+turn of a forward camera, and the way of a downward one.
 """
 
 from __future__ import annotations
@@ -63,12 +64,29 @@ def image_motion(before: NDArray[np.uint8], after: NDArray[np.uint8], pixel: flo
     if good.sum() < LEAST_CORNERS:
         return UNKNOWN
     first, second = corners[good, 0].astype(np.float64), moved[good, 0].astype(np.float64)
-    matrix, inliers = cv2.estimateAffinePartial2D(first, second, method=cv2.RANSAC, ransacReprojThreshold=1.0)
-    if matrix is None or inliers.sum() < max(LEAST_CORNERS, LEAST_SHARE * len(first)):
+    mapping = _mapping(first, second)
+    if mapping is None:
         return UNKNOWN
     centre = 0.5 * np.array([before.shape[1] - 1, before.shape[0] - 1])
-    shift = (matrix[:, :2] @ centre + matrix[:, 2] - centre) * pixel
-    return ImageMotion(math.atan2(matrix[1, 0], matrix[0, 0]), (float(shift[0]), float(shift[1])))
+    return _at(mapping, centre, pixel)
+
+
+def _mapping(first: Floats, second: Floats) -> Floats | None:
+    """The homography [3, 3] that takes enough points [n, 2] to the others, None if there is none."""
+    mapping, inliers = cv2.findHomography(first, second, method=cv2.RANSAC, ransacReprojThreshold=1.0)
+    if mapping is None or inliers.sum() < max(LEAST_CORNERS, LEAST_SHARE * len(first)):
+        return None
+    return np.asarray(mapping)
+
+
+def _at(mapping: Floats, point: Floats, pixel: float) -> ImageMotion:
+    """Turn and shift of a homography p' = (A p + t) / w [3, 3] at a point [2]: J = dp'/dp = (A - p' hᵀ) / w there."""
+    *mapped, w = mapping @ np.append(point, 1.0)
+    moved = np.array(mapped) / w
+    slopes = (mapping[:2, :2] - np.outer(moved, mapping[2, :2])) / w
+    turn = math.atan2(slopes[1, 0] - slopes[0, 1], slopes[0, 0] + slopes[1, 1])
+    shift = (moved - point) * pixel
+    return ImageMotion(turn, (float(shift[0]), float(shift[1])))
 
 
 class Motions:

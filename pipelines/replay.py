@@ -250,7 +250,7 @@ def _decoded_ahead(
 
     Images that are only shown stay as they are.
     """
-    waiting: deque[tuple[Sample, Future[Sample]]] = deque()
+    waiting: deque[tuple[Sample, Future[Sample] | None]] = deque()
     images = 0
     pool = ThreadPoolExecutor(threads, thread_name_prefix="decode")
     try:
@@ -260,10 +260,10 @@ def _decoded_ahead(
             while waiting and (images > ahead or not _decodes(waiting[0][0], shown)):
                 sample, future = waiting.popleft()
                 images -= _decodes(sample, shown)
-                yield sample, future.result()
+                yield sample, sample if future is None else future.result()
         while waiting:
             sample, future = waiting.popleft()
-            yield sample, future.result()
+            yield sample, sample if future is None else future.result()
     finally:
         pool.shutdown(cancel_futures=True)
 
@@ -275,8 +275,8 @@ def _decodes(sample: Sample, shown: Sequence[str]) -> bool:
 
 def _submitted(
     samples: Iterator[Sample], pool: ThreadPoolExecutor, shown: Sequence[str]
-) -> Iterator[tuple[Sample, Future[Sample]]]:
-    """Pair every sample with the future of its decoded form.
+) -> Iterator[tuple[Sample, Future[Sample] | None]]:
+    """Pair every sample with the future of its decoded form, None where it stays as it is.
 
     An error of the reader is held back until the samples before it are through: it is the result of
     one last future.
@@ -287,20 +287,12 @@ def _submitted(
             if isinstance(last, ImageSample) and _decodes(last, shown):
                 yield last, pool.submit(grey_sample, last)
             else:
-                yield last, _settled(last)
+                yield last, None
     except Exception as error:
         error.add_note(f"after {_where(last)[3:]}" if last.stream else "before the first sample")
-        yield last, _settled(error)
-
-
-def _settled(outcome: Sample | Exception) -> Future[Sample]:
-    """A future that is done."""
-    future: Future[Sample] = Future()
-    if isinstance(outcome, Exception):
-        future.set_exception(outcome)
-    else:
-        future.set_result(outcome)
-    return future
+        failed: Future[Sample] = Future()
+        failed.set_exception(error)
+        yield last, failed
 
 
 def _where(sample: Sample) -> str:

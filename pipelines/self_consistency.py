@@ -25,7 +25,7 @@ from scipy.spatial import cKDTree
 
 from pipelines.drift import DriftBudget, drift_budget
 from pipelines.evaluation import Floats, Trajectory, motions, path_lengths
-from pipelines.geometry import wrap_angle
+from pipelines.planar import wrap_angle
 from readers.streams import (
     Camera,
     Damage,

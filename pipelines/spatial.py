@@ -18,7 +18,7 @@ from scipy.spatial.transform import Rotation
 
 from pipelines import evaluation as planar
 from pipelines.evaluation import Method, Statistics, Trajectory, neighbours
-from pipelines.geometry import heading_of_quat, quat_of_heading
+from pipelines.planar import heading_of_quat, quat_of_heading
 from readers.streams import PoseSample
 
 Floats = NDArray[np.float64]

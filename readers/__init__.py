@@ -17,6 +17,7 @@ if TYPE_CHECKING:
     from tempfile import TemporaryDirectory
 
     from readers.bag_folder import BagMetadata
+    from readers.index_cache import Entry
     from readers.message_log import MessageLog
 
 __all__ = ["ReadOptions", "Recording", "RecordingError", "open_recording"]
@@ -80,7 +81,7 @@ def _open_file(path: Path, options: ReadOptions) -> Recording:
     from readers.log_recording import LogRecording
 
     scratch: list[TemporaryDirectory[str]] = []
-    log = _open_log(path, scratch)
+    log = _open_log(path, scratch, _kept(path, options))
     if log is not None:
         return LogRecording(path, [log], options, scratch=scratch[0] if scratch else None)
     if (recording := _ask_plugins(path, options)) is not None:
@@ -105,7 +106,15 @@ def _start_of(path: Path) -> bytes:
         return file.read(16)
 
 
-def _open_log(path: Path, scratch: list[TemporaryDirectory[str]]) -> MessageLog | None:
+def _kept(path: Path, options: ReadOptions) -> Entry | None:
+    """Where the index of a log is kept; None if it is not to be."""
+    from readers.index_cache import Entry, user_folder
+
+    folder = user_folder() if options.cache else None
+    return Entry(path, folder) if folder is not None else None
+
+
+def _open_log(path: Path, scratch: list[TemporaryDirectory[str]], cached: Entry | None = None) -> MessageLog | None:
     """The container reader that the first bytes of the file ask for; None if they ask for none.
 
     A file that is packed with zstd is unpacked into a temporary folder, which is added to `scratch`.
@@ -116,15 +125,15 @@ def _open_log(path: Path, scratch: list[TemporaryDirectory[str]]) -> MessageLog 
     if start.startswith(MCAP):
         from readers.mcap_log import McapLog
 
-        return McapLog(path)
+        return McapLog(path, cached)
     if start.startswith(ROS1):
         from readers.ros1_bag import Ros1Log
 
-        return Ros1Log(path)
+        return Ros1Log(path, cached)
     if start.startswith(SQLITE):
         from readers.ros2_db3 import SqliteLog
 
-        return SqliteLog(path)
+        return SqliteLog(path, cached)
     if start.startswith(ZSTD):
         from readers.bag_folder import unpack
 
@@ -216,7 +225,7 @@ def _join(
     remarks = list(notes)
     for file in files:
         try:
-            log = _open_log(file, scratch)
+            log = _open_log(file, scratch, _kept(file, options))
             if log is None:
                 raise RecordingError(file, "it is no file of a bag", "remove it from the folder")
             logs.append(log)

@@ -13,7 +13,9 @@ from collections.abc import Iterator, Mapping, Sequence
 
 from readers.camera_files import plain_topic, read_camera, read_cameras, scaled
 from readers.clock import merge
+from readers.extras import Extras
 from readers.log_recording import LogRecording
+from readers.sample_arrays import ARRAY_ROWS, StructuredArray
 from readers.streams import (
     Camera,
     CameraFile,
@@ -64,7 +66,7 @@ def _cameras(recording: Recording, options: ReadOptions) -> tuple[dict[str, Came
             notes += calibration.notes
     if options.scale_cameras:
         for topic, camera in (recording.cameras | found).items():
-            size = _image_size(recording, topic)
+            size = image_size(recording, topic)
             if camera.calibrated and size is not None and size != (camera.width_px, camera.height_px):
                 try:
                     found[topic] = scaled(camera, *size)
@@ -94,8 +96,8 @@ def _topics_of(recording: Recording, file: CameraFile, images: list[str]) -> lis
     return matching
 
 
-def _image_size(recording: Recording, topic: str) -> tuple[int, int] | None:
-    """Width and height of the first image of a stream, None where none can be told."""
+def image_size(recording: Recording, topic: str) -> tuple[int, int] | None:
+    """Width and height in px of the first image of a stream, None where none can be told."""
     for sample in itertools.islice(recording.read([topic]), FIRST_IMAGES):
         if isinstance(sample, ImageSample):
             if sample.width_px:
@@ -168,6 +170,15 @@ class Adjusted(Recording):
         return self._inner.damage
 
     @property
+    def cache_troubles(self) -> tuple[str, ...]:
+        """What was wrong with the cache of indexes."""
+        return self._inner.cache_troubles
+
+    def extras(self) -> Extras:
+        """Attachments and metadata of the log."""
+        return self._inner.extras()
+
+    @property
     def identity(self) -> str:
         """See `Recording.identity`; times and cameras are settings, not the recording."""
         return self._inner.identity
@@ -200,6 +211,14 @@ class Adjusted(Recording):
             for sample in map(self._moved, self._inner.arrivals([name]))
             if (start_ns is None or sample.t_ns >= start_ns) and (stop_ns is None or sample.t_ns < stop_ns)
         )
+
+    def arrays(
+        self, stream: str, start_ns: int | None = None, stop_ns: int | None = None, *, rows: int = ARRAY_ROWS
+    ) -> Iterator[StructuredArray]:
+        """The samples of a stream as rows, see `Recording.arrays`."""
+        if stream in self._by_log or stream in self._offsets:
+            return super().arrays(stream, start_ns, stop_ns, rows=rows)
+        return self._inner.arrays(stream, start_ns, stop_ns, rows=rows)
 
     def arrivals(self, streams: Sequence[str] | None = None) -> Iterator[Sample]:
         """Yield samples in the order in which they were received, see `Recording.arrivals`."""

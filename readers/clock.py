@@ -111,7 +111,8 @@ class StreamAudit:
     def add(self, sample: Sample) -> None:
         """Take note of the next sample of this stream."""
         self.samples += 1
-        self.counts.update(sample.oddities)
+        if sample.oddities:
+            self.counts.update(sample.oddities)
         if isinstance(sample, Problem):
             self.counts["undecodable"] += 1
             return
@@ -128,7 +129,7 @@ class StreamAudit:
             self.first_ns = sample.t_ns
         self.last_ns = max(self.last_ns, sample.t_ns)
         quat = getattr(sample, "quat_xyzw", None)
-        if quat is not None and not np.any(quat):
+        if quat is not None and quat[3] == 0.0 and not np.any(quat):
             self.counts["zero_quaternion"] += 1
         if isinstance(sample, ImageSample) and sample.width_px:
             size = (sample.width_px, sample.height_px)

@@ -17,29 +17,17 @@ from types import SimpleNamespace
 from typing import Any, NamedTuple
 
 import zstandard
-from google.protobuf import (  # type: ignore[import-untyped, unused-ignore]
-    descriptor_pb2,
-    descriptor_pool,
-    duration_pb2,
-    message_factory,
-    timestamp_pb2,
-)
-from google.protobuf.message import DecodeError  # type: ignore[import-untyped, unused-ignore]
 from rosbags.serde import SerdeError
 from rosbags.typesys import Stores, TypesysError, get_types_from_idl, get_types_from_msg, get_typestore
 
 from readers import ros1_wire
 from readers.message_log import Buffer, Channel, text
+from readers.message_log import MessageError as MessageError
 
 Decoder = Callable[[Buffer], Any]
 LARGEST_MESSAGE_BYTES = 2**28
 ZSTD_MAGIC = b"\x28\xb5\x2f\xfd"
-_WELL_KNOWN = {module.DESCRIPTOR.name: module.DESCRIPTOR for module in (duration_pb2, timestamp_pb2)}
 _IDL_RULE = "=" * 80 + "\n"
-
-
-class MessageError(Exception):
-    """A message, or the definition of one, that cannot be used; the text is a clause that says why."""
 
 
 class Definitions(NamedTuple):
@@ -63,7 +51,9 @@ def decoder_of(channel: Channel, definitions: Definitions = Definitions()) -> De
     if channel.encoding == "json":
         return _decode_json
     if channel.encoding == "protobuf":
-        return _protobuf_decoder(channel.type, channel.schema)
+        from readers import protobuf_wire  # takes longer to load than a small log to read
+
+        return protobuf_wire.decoder(channel.type, channel.schema)
     raise MessageError(f"serialization format {channel.encoding!r} is not supported")
 
 
@@ -71,10 +61,9 @@ def definition_text(channel: Channel) -> str:
     """The channel's definition for people to read."""
     if channel.schema_encoding != "protobuf":
         return text(channel.schema)
-    try:
-        return str(descriptor_pb2.FileDescriptorSet.FromString(channel.schema))
-    except DecodeError:
-        return f"{len(channel.schema)} bytes that are no FileDescriptorSet"
+    from readers import protobuf_wire
+
+    return protobuf_wire.definition_text(channel.schema)
 
 
 def ros_name(name: str) -> str:
@@ -137,6 +126,11 @@ def _ros_decoder(
             raise MessageError(f"the message does not fit {type_name} ({error})") from error
 
     return decode
+
+
+def has_fixed_layout(decode: Decoder) -> bool:
+    """Whether it decodes ROS 1 messages of a standard definition, whose layout is known."""
+    return isinstance(decode, partial) and decode.func is _decode_fixed
 
 
 def _decode_fixed(decode: Decoder, type_name: str, data: Buffer) -> Any:
@@ -228,38 +222,3 @@ def _decode_json(data: Buffer) -> Any:
         return json.loads(bytes(data), object_hook=lambda fields: SimpleNamespace(**fields))
     except (ValueError, RecursionError) as error:
         raise MessageError(f"the message is no JSON ({error})") from error
-
-
-@lru_cache(maxsize=256)
-def _protobuf_decoder(type_name: str, schema: bytes) -> Decoder:
-    try:
-        files = {file.name: file for file in descriptor_pb2.FileDescriptorSet.FromString(schema).file}
-        pool = descriptor_pool.DescriptorPool()
-        added: set[str] = set()
-
-        def add(name: str) -> None:
-            if name in added:
-                return
-            added.add(name)
-            file = files.get(name)
-            if file is None:
-                file = descriptor_pb2.FileDescriptorProto()
-                _WELL_KNOWN[name].CopyToProto(file)
-            for dependency in file.dependency:
-                add(dependency)
-            pool.Add(file)
-
-        for name in files:
-            add(name)
-        message_class = message_factory.GetMessageClass(pool.FindMessageTypeByName(type_name))
-    except (DecodeError, KeyError, TypeError, ValueError) as error:
-        reason = " ".join(str(error).split())[:120]
-        raise MessageError(f"the definition of {type_name} in the log cannot be parsed ({reason})") from error
-
-    def decode(data: Buffer) -> Any:
-        try:
-            return message_class.FromString(bytes(data))
-        except (DecodeError, ValueError) as error:
-            raise MessageError(f"the message does not fit {type_name} ({error})") from error
-
-    return decode

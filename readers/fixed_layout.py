@@ -14,7 +14,16 @@ import numpy as np
 
 from readers.decoding import ros_name
 from readers.message_log import Buffer, Channel, text
-from readers.messages import Arrival, image_sample, imu_sample, odometry_sample
+from readers.messages import (
+    Arrival,
+    camera_sample,
+    compressed_sample,
+    image_sample,
+    imu_sample,
+    odometry_sample,
+    plain_frame,
+    pose_sample,
+)
 from readers.streams import Sample
 
 FixedReader = Callable[[Buffer, Arrival], Sample | None]
@@ -41,6 +50,28 @@ _PARTS: dict[str, Fields] = {
         "uint32 step",
         "uint8[] data",
     ),
+    "sensor_msgs/CompressedImage": ("std_msgs/Header header", "string format", "uint8[] data"),
+    "sensor_msgs/CameraInfo": (
+        "std_msgs/Header header",
+        "uint32 height",
+        "uint32 width",
+        "string distortion_model",
+        "float64[] d",
+        "float64[9] k",
+        "float64[9] r",
+        "float64[12] p",
+        "uint32 binning_x",
+        "uint32 binning_y",
+        "RegionOfInterest roi",
+    ),
+    "sensor_msgs/RegionOfInterest": (
+        "uint32 x_offset",
+        "uint32 y_offset",
+        "uint32 height",
+        "uint32 width",
+        "bool do_rectify",
+    ),
+    "geometry_msgs/PoseStamped": ("std_msgs/Header header", "Pose pose"),
     "sensor_msgs/Imu": (
         "std_msgs/Header header",
         "geometry_msgs/Quaternion orientation",
@@ -61,7 +92,8 @@ _STANDARD = {name: tuple(field.rpartition("/")[2] for field in fields) for name,
 _START = struct.Struct("<4siII")
 _U32 = struct.Struct("<I")
 _IMAGE_SIZE = struct.Struct("<II")
-_IMU_NUMBERS, _ODOMETRY_NUMBERS = 37, 85
+_IMU_NUMBERS, _ODOMETRY_NUMBERS, _POSE_NUMBERS, _CAMERA_NUMBERS = 37, 85, 7, 30
+_AFTER_CAMERA_BYTES = 25
 _FLOAT = np.dtype("<f8")
 _LITTLE_ENDIAN = b"\0\1\0\0"
 
@@ -82,7 +114,7 @@ def fixed_reader(channel: Channel) -> FixedReader | None:
 def header_of(data: Buffer) -> tuple[int, str] | None:
     """Stamp in ns and frame of a message that begins with a header; None if it is not little-endian CDR."""
     found = _header(data)
-    return None if found is None else (found[0], text(data[_START.size : found[1]]).rstrip("\0").lstrip("/"))
+    return None if found is None else (found[0], _frame(data, found[1]))
 
 
 def _is_standard(name: str, schema: bytes) -> bool:
@@ -104,7 +136,7 @@ def _is_standard(name: str, schema: bytes) -> bool:
 def _complete(name: str, fields: dict[str, list[str]]) -> bool:
     """Whether all parts of a definition come with it."""
     needed = {field.split()[0].partition("[")[0] for found in fields.values() for field in found}
-    plain = {"float64", "uint32", "int32", "uint8", "string"}
+    plain = {"float64", "uint32", "int32", "uint8", "bool", "string"}
     return needed - plain <= {part.rpartition("/")[2] for part in fields}
 
 
@@ -117,6 +149,20 @@ def _header(data: Buffer) -> tuple[int, int] | None:
     if kind != _LITTLE_ENDIAN or end > len(data):
         return None
     return seconds * 1_000_000_000 + nanoseconds, end
+
+
+def _frame(data: Buffer, end: int) -> str:
+    """The frame that a header names."""
+    return plain_frame(text(data[_START.size : end]).rstrip("\0"))
+
+
+def _sized(data: Buffer, at: int) -> tuple[int, int] | None:
+    """Where a text begins and where it ends, with its last zero; None if there is none, or it is not all there."""
+    at += -at % 4
+    if at + 4 > len(data):
+        return None
+    (length,) = _U32.unpack_from(data, at)
+    return (at + 4, at + 4 + length) if 0 < length <= len(data) - at - 4 else None
 
 
 def imu_numbers_at(data: Buffer) -> int | None:
@@ -178,7 +224,49 @@ def _image(data: Buffer, arrival: Arrival) -> Sample | None:
     return image_sample(arrival, header[0], encoding, pixels, width, height, step, bool(data[end]))
 
 
+def _compressed_image(data: Buffer, arrival: Arrival) -> Sample | None:
+    if (header := _header(data)) is None or (form := _sized(data, header[1])) is None:
+        return None
+    at = form[1] + -form[1] % 4 + 4
+    if at > len(data) or at + _U32.unpack_from(data, at - 4)[0] != len(data):
+        return None
+    return compressed_sample(arrival, header[0], text(data[form[0] : form[1] - 1]), memoryview(data)[at:])
+
+
+def _camera_info(data: Buffer, arrival: Arrival) -> Sample | None:
+    if (header := _header(data)) is None:
+        return None
+    at = header[1] + -header[1] % 4
+    if at + _IMAGE_SIZE.size > len(data) or (model := _sized(data, at + _IMAGE_SIZE.size)) is None:
+        return None
+    height, width = _IMAGE_SIZE.unpack_from(data, at)
+    at = model[1] + -model[1] % 4 + 4
+    if at > len(data):
+        return None
+    (count,) = _U32.unpack_from(data, at - 4)
+    at += (4 - at) % 8
+    if at + 8 * (count + _CAMERA_NUMBERS) + _AFTER_CAMERA_BYTES != len(data):
+        return None
+    n = np.frombuffer(bytes(data[at:-_AFTER_CAMERA_BYTES]), _FLOAT)
+    name = text(data[model[0] : model[1] - 1])
+    parts = np.split(n, [count, count + 9, count + 18])
+    return camera_sample(arrival, header[0], _frame(data, header[1]), width, height, name, *parts)
+
+
+def _pose(data: Buffer, arrival: Arrival) -> Sample | None:
+    if (header := _header(data)) is None:
+        return None
+    at = header[1] + (4 - header[1]) % 8
+    if at + 8 * _POSE_NUMBERS != len(data):
+        return None
+    n = np.frombuffer(bytes(data[at:]), _FLOAT)
+    return pose_sample(arrival, header[0], _frame(data, header[1]), n[:3], n[3:])
+
+
 _READERS: dict[str, FixedReader] = {
+    "geometry_msgs/PoseStamped": _pose,
+    "sensor_msgs/CameraInfo": _camera_info,
+    "sensor_msgs/CompressedImage": _compressed_image,
     "sensor_msgs/Image": _image,
     "sensor_msgs/Imu": _imu,
     "nav_msgs/Odometry": _odometry,

@@ -1,4 +1,4 @@
-"""CDR messages that are numbers behind texts, many at a time → samples.
+"""Messages of CDR and ROS 1 that are numbers behind texts, many at a time → samples.
 
 As long as its texts have the same length, the messages of a channel have one length and are the rows of one array.
 Rows of which there is something to note or to mend are left to the reading of single messages, `readers.fixed_layout`.
@@ -15,6 +15,7 @@ from typing import Any, NamedTuple, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from readers import ros1_wire
 from readers.clock import DAY_NS
 from readers.decoding import ros_name
 from readers.fixed_layout import imu_numbers_at, odometry_numbers_at
@@ -27,45 +28,83 @@ Columns = dict[str, Iterable[FloatArray]]
 _SECOND_NS = np.int64(1_000_000_000)
 
 
+class _Rows(NamedTuple):
+    """Messages of one layout: times [N] in ns, numbers [N, n], and which of them need no care."""
+
+    kind: _Kind
+    received_ns: NDArray[np.int64]
+    header_ns: NDArray[np.int64]
+    numbers: FloatArray
+    plain: NDArray[np.bool_]
+
+
+def _rows_of(messages: Sequence[Message]) -> _Rows | None:
+    """The numbers of messages of one channel that has a fixed layout; None if they are not rows of one layout."""
+    channel, first = messages[0].channel, messages[0].data
+    kind = _KINDS.get((channel.encoding, ros_name(channel.type).replace("/msg/", "/")))
+    if kind is None or (at := kind.numbers_at(first)) is None:
+        return None
+    data = [message.data for message in messages]
+    if set(map(len, data)) != {len(first)}:
+        return None
+    table = np.frombuffer(b"".join(data), _row_type(len(first), at))
+    if np.any(table["texts"] != table["texts"][0]):
+        return None
+    if channel.encoding == "cdr" and np.any(table["mark"] != table["mark"][0]):  # ROS 1 has a number there
+        return None
+    try:
+        received_ns = np.array([message.log_ns for message in messages], np.int64)
+    except OverflowError:
+        return None
+    header_ns = table["seconds"] * _SECOND_NS + table["nanoseconds"]
+    numbers = np.frombuffer(table["numbers"].tobytes(), "<f8").reshape(len(data), -1)  # aligned, and read-only
+    plain = kind.plain(numbers) & (header_ns > 0) & (np.abs(header_ns - received_ns) < DAY_NS)
+    return _Rows(kind, received_ns, header_ns, numbers, plain)
+
+
 def read_rows(messages: Sequence[Message], stream: str, offset_ns: int) -> Sequence[Sample | None]:
     """The samples of messages of one channel that has a fixed layout, at their header stamps plus `offset_ns`.
 
     None for a message that is to be read by itself; nothing at all if they are not rows of one layout.
     """
-    kind = _KINDS.get(ros_name(messages[0].channel.type).replace("/msg/", "/"))
-    first = messages[0].data
-    if kind is None or (at := kind.numbers_at(first)) is None:
+    if (rows := _rows_of(messages)) is None:
         return ()
-    data = [message.data for message in messages]
-    if set(map(len, data)) != {len(first)}:
-        return ()
-    table = np.frombuffer(b"".join(data), _row_type(len(first), at))
-    if np.any(table["mark"] != table["mark"][0]) or np.any(table["texts"] != table["texts"][0]):
-        return ()
-    logged_ns = [message.log_ns for message in messages]
-    try:
-        received_ns = np.array(logged_ns, np.int64)
-    except OverflowError:
-        return ()
-    header_ns = table["seconds"] * _SECOND_NS + table["nanoseconds"]
-    numbers = np.frombuffer(table["numbers"].tobytes(), "<f8").reshape(len(data), -1)  # aligned, and read-only
-    plain = kind.plain(numbers) & (header_ns > 0) & (np.abs(header_ns - received_ns) < DAY_NS)
-    stamps = header_ns.tolist()
+    stamps = rows.header_ns.tolist()
     samples: list[Any] = _made(
-        kind.sample,
-        len(data),
+        rows.kind.sample,
+        len(messages),
         stream=repeat(stream),
-        t_ns=stamps if not offset_ns else (header_ns + offset_ns).tolist(),
-        received_ns=logged_ns,
+        t_ns=stamps if not offset_ns else (rows.header_ns + offset_ns).tolist(),
+        received_ns=[message.log_ns for message in messages],
         oddities=repeat(()),
         header_ns=stamps,
         published_ns=[message.publish_ns for message in messages],
-        **kind.columns(numbers),
+        **rows.kind.columns(rows.numbers),
     )
-    if not plain.all():
-        for place in np.flatnonzero(~plain):
+    if not rows.plain.all():
+        for place in np.flatnonzero(~rows.plain):
             samples[place] = None
     return samples
+
+
+def fill_rows(messages: Sequence[Message], offset_ns: int, out: NDArray[np.void]) -> NDArray[np.bool_]:
+    """Write what `read_rows` makes of the messages into rows of `readers.sample_arrays`.
+
+    Returns:
+        Which rows of `out` were written; the messages of the others are to be read by themselves.
+    """
+    none = np.zeros(len(messages), bool)
+    if (rows := _rows_of(messages)) is None:
+        return none
+    try:
+        out["published_ns"] = [message.publish_ns for message in messages]
+    except OverflowError:
+        return none
+    out["t_ns"], out["header_ns"], out["received_ns"] = rows.header_ns + offset_ns, rows.header_ns, rows.received_ns
+    for name, values in rows.kind.columns(rows.numbers).items():
+        out[name] = values
+    out["readable"] = True
+    return rows.plain
 
 
 @lru_cache(maxsize=64)
@@ -139,7 +178,11 @@ class _Kind(NamedTuple):
     columns: Callable[[FloatArray], Columns]
 
 
+_IMU = _Kind(ImuSample, imu_numbers_at, _plain_imu, _imu_columns)
+_ODOMETRY = _Kind(OdometrySample, odometry_numbers_at, _plain_odometry, _odometry_columns)
 _KINDS = {
-    "sensor_msgs/Imu": _Kind(ImuSample, imu_numbers_at, _plain_imu, _imu_columns),
-    "nav_msgs/Odometry": _Kind(OdometrySample, odometry_numbers_at, _plain_odometry, _odometry_columns),
+    ("cdr", "sensor_msgs/Imu"): _IMU,
+    ("cdr", "nav_msgs/Odometry"): _ODOMETRY,
+    ("ros1", "sensor_msgs/Imu"): _IMU._replace(numbers_at=ros1_wire.imu_numbers_at),
+    ("ros1", "nav_msgs/Odometry"): _ODOMETRY._replace(numbers_at=ros1_wire.odometry_numbers_at),
 }

@@ -18,9 +18,10 @@ from typing import Any
 import numpy as np
 
 from readers.clock import REORDER_WINDOW_NS, SECOND_NS, merge, reorder, sane_stamp
-from readers.decoding import Decoder, Definitions, MessageError, decoder_of, definition_text
+from readers.decoding import Decoder, Definitions, MessageError, decoder_of, definition_text, has_fixed_layout
+from readers.extras import Extras
 from readers.fixed_layout import FixedReader, fixed_reader, header_of
-from readers.fixed_rows import read_rows
+from readers.fixed_rows import fill_rows, read_rows
 from readers.message_log import Buffer, Channel, Message, MessageLog, Source, in_log_order
 from readers.messages import (
     Arrival,
@@ -35,6 +36,7 @@ from readers.messages import (
     stamp_ns,
 )
 from readers.salvage import Loss
+from readers.sample_arrays import ARRAY_ROWS, StructuredArray, blank, gathered, reordered, row_type, rows_of, within
 from readers.streams import (
     Camera,
     CameraInfo,
@@ -51,7 +53,7 @@ from readers.streams import (
 
 SLACK_NS = 2 * SECOND_NS
 FIRST_MESSAGES = 10
-BATCH_BYTES = 1 << 20
+BATCH_BYTES = 1 << 21
 BATCH_MESSAGES = 256
 FEWEST_ROWS = 4
 FRAME_SEARCH_NS = 30 * SECOND_NS
@@ -115,9 +117,41 @@ class Topic:
 
     def rows(self, messages: Sequence[Message]) -> Sequence[Sample | None]:
         """The samples of messages of one channel, as far as they can be made together; none, or None, for others."""
-        if messages[0].channel not in self.fixed or not self.trust_stamps or self.clock is not Clock.HEADER:
+        if not self.at_header_stamps or not self.known(messages[0].channel):
             return ()
         return read_rows(messages, self.name, self.offset_ns)
+
+    @property
+    def at_header_stamps(self) -> bool:
+        """Whether samples are of the time of their headers, as messages that are decoded together have to be."""
+        return self.trust_stamps and self.clock is Clock.HEADER
+
+    @property
+    def has_rows(self) -> bool:
+        """Whether messages can be decoded together: those of a fixed layout, at their header stamps."""
+        return self.at_header_stamps and any(map(self.known, self.channels))
+
+    def known(self, channel: Channel) -> bool:
+        """Whether the layout of a channel's messages is known."""
+        decode = self.decoders.get(channel)
+        return channel in self.fixed or (decode is not None and has_fixed_layout(decode))
+
+    def array(self, messages: Sequence[Message], columns: np.dtype[np.void]) -> StructuredArray:
+        """The samples of messages as rows, as `readers.sample_arrays` has them, in the order of the messages."""
+        places: dict[Channel, list[int]] = {}
+        for place, message in enumerate(messages):
+            places.setdefault(message.channel, []).append(place)
+        rows = blank(len(messages), columns)
+        for channel, own in places.items():
+            written = np.zeros(len(own), bool)
+            if self.known(channel):
+                together = blank(len(own), columns)
+                written = fill_rows([messages[place] for place in own], self.offset_ns, together)
+                rows[np.array(own)[written]] = together[written]
+            alone = [place for place, done in zip(own, written, strict=True) if not done]
+            if alone:
+                rows[alone] = rows_of([sample for place in alone for sample in self.samples(messages[place])], columns)
+        return rows
 
     def samples(self, message: Message) -> Iterator[Sample]:
         """The samples of one message; a `Problem` if it cannot be made into any."""
@@ -326,6 +360,18 @@ class LogRecording(Recording):
         return tuple(loss for log in self._logs for loss in log.losses)
 
     @property
+    def cache_troubles(self) -> tuple[str, ...]:
+        """What was wrong with the cache of indexes, one sentence each."""
+        return tuple(log.cached.trouble for log in self._logs if log.cached is not None and log.cached.trouble)
+
+    def extras(self) -> Extras:
+        """Attachments and metadata, which MCAP files can have; those that are lost become damage."""
+        found = Extras()
+        for log in self._logs:
+            found.add(log.extras())
+        return found
+
+    @property
     def definitions(self) -> Definitions:
         """Where definitions are looked up that the log does not have."""
         return Definitions(self._options.distribution, self._options.msg_folder)
@@ -394,6 +440,21 @@ class LogRecording(Recording):
         groups = [self._read_group(g, wanted, start_ns, stop_ns) for g in self._clock_groups(wanted)]
         return groups[0] if len(groups) == 1 else merge(*groups)
 
+    def arrays(
+        self, stream: str, start_ns: int | None = None, stop_ns: int | None = None, *, rows: int = ARRAY_ROWS
+    ) -> Iterator[StructuredArray]:
+        """The samples of a stream as rows, see `Recording.arrays`; IMU and odometry in CDR without samples between."""
+        columns = row_type(self.stream(stream))
+        self._wanted([stream])
+        topic = next(t for t in self._topics if any(info.name == stream for info in t.streams))
+        if not topic.has_rows:
+            return super().arrays(stream, start_ns, stop_ns, rows=rows)
+        messages = self._messages(topic.channels, *self._log_range([topic], start_ns, stop_ns))
+        batches = iter(lambda: list(itertools.islice(messages, min(rows, BATCH_MESSAGES))), [])
+        pieces = gathered((topic.array(batch, columns) for batch in batches), rows)
+        ordered = reordered(pieces, lag_ns=topic.lag_ns)
+        return (found for piece in ordered if len(found := within(piece, start_ns, stop_ns)))
+
     def arrivals(self, streams: Sequence[str] | None = None) -> Iterator[Sample]:
         """Yield samples in the order of the log, see `Recording.arrivals`."""
         wanted = self._wanted(streams)
@@ -425,17 +486,22 @@ class LogRecording(Recording):
                 groups.append([topic])
         return groups
 
+    def _log_range(
+        self, topics: Sequence[Topic], start_ns: int | None, stop_ns: int | None
+    ) -> tuple[int | None, int | None]:
+        """The log times between which the samples of a range of time can lie; topics in the order of their lags."""
+        return (
+            None if start_ns is None else start_ns + topics[0].lag_ns - SLACK_NS,
+            None if stop_ns is None else stop_ns + topics[-1].lag_ns + SLACK_NS,
+        )
+
     def _read_group(
         self, topics: list[Topic], wanted: Collection[str], start_ns: int | None, stop_ns: int | None
     ) -> Iterator[Sample]:
         """Samples of topics with about the same lag, in the order of their stamps."""
-        low, high = topics[0].lag_ns, topics[-1].lag_ns
+        high = topics[-1].lag_ns
         by_channel = {channel: topic for topic in topics for channel in topic.channels}
-        messages = self._messages(
-            by_channel,
-            None if start_ns is None else start_ns + low - SLACK_NS,
-            None if stop_ns is None else stop_ns + high + SLACK_NS,
-        )
+        messages = self._messages(by_channel, *self._log_range(topics, start_ns, stop_ns))
         samples = (sample for sample in _samples(messages, by_channel) if sample.stream in wanted)
         for sample in reorder(samples, lag_ns=high):
             if (start_ns is None or sample.t_ns >= start_ns) and (stop_ns is None or sample.t_ns < stop_ns):

@@ -18,6 +18,10 @@ from types import MappingProxyType
 import numpy as np
 
 from readers.ahead import WORTH_A_THREAD_S
+from readers.extras import Extras
+from readers.index_cache import Entry, State
+from readers.index_states import mcap_state, put_mcap
+from readers.mcap_extras import ExtrasWalk
 from readers.mcap_records import (
     FOOTER,
     HEAD,
@@ -63,8 +67,8 @@ class McapLog(IndexedLog):
         RecordingError: the file does not begin like an MCAP file.
     """
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, "MCAP")
+    def __init__(self, path: Path, cached: Entry | None = None) -> None:
+        super().__init__(path, "MCAP", cached)
         if not path.stat().st_size:
             raise RecordingError(path, "the file is empty (0 bytes)", "record or copy it again")
         with path.open("rb") as file:
@@ -76,6 +80,7 @@ class McapLog(IndexedLog):
         self.told: set[int] = set()
         self._thread: ThreadPoolExecutor | None = None
         self._given_s = 0.0
+        self._extras: Extras | None = None
         try:
             self._open()
         except BaseException:
@@ -89,11 +94,17 @@ class McapLog(IndexedLog):
         fault = self._read_summary(segment)
         if fault is None:
             self._find_edges()
-        else:
+        elif not self.recall(self._put):
+            begun = time.perf_counter()
             self._blocks.clear()
             Scan(self, segment, fault).run()
+            blocks = [block for block in self._blocks if isinstance(block, McapBlock)]
+            self.keep(lambda: mcap_state(self, blocks), time.perf_counter() - begun)
         if segment.profile:
             self.format = f"MCAP, profile {segment.profile}"
+
+    def _put(self, state: State) -> None:
+        self._blocks = [*put_mcap(self, state)]
 
     def profile(self, start: int) -> str:
         """The profile of the file that begins at `start`, "" if its header is damaged."""
@@ -340,7 +351,7 @@ class McapLog(IndexedLog):
         while len(self._unpacked) > kept:
             self._unpacked.popitem(last=False)
         self._given_s = time.perf_counter()
-        if unpacked.faults and block.offset not in self.told:
+        if unpacked.faults and (unpacked.withheld or block.offset not in self.told):
             self.told.add(block.offset)
             self._report_block(block, unpacked)
         return unpacked
@@ -432,11 +443,19 @@ class McapLog(IndexedLog):
             span = (block.offset, block.offset + block.size)
             self.report(Cause.CHECKSUM, text, *span, counts, (block.first_ns, block.last_ns))
 
+    def extras(self) -> Extras:
+        """Attachments and metadata; the file is walked over once, from record to record."""
+        if self._extras is None:
+            segment = next((block.segment for block in self._blocks if isinstance(block, McapBlock)), Segment())
+            self._extras = ExtrasWalk(self, segment).run()
+        return self._extras
+
     def close(self) -> None:
         """Release the file; images that are still held keep their part of it."""
         if self._thread is not None:
             self._thread.shutdown(wait=True, cancel_futures=True)
         self._unpacked.clear()
+        self._extras = None
         try:
             self.view.release()
             self._map.close()

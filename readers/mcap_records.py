@@ -205,6 +205,72 @@ def read_message_index(body: memoryview) -> tuple[int, NDArray[np.void]]:
     return number, np.frombuffer(entries, INDEX_ENTRY)
 
 
+# ------------------------------------------------------------------- attachments, metadata
+
+
+def _attachment_parts(body: memoryview) -> tuple[memoryview, memoryview, int, int]:
+    """Name, media type, and where the data of an attachment begin and end; its checksum follows."""
+    title, at = _sized(body, _SIZES.size)
+    media_type, at = _sized(body, at)
+    (size,) = _unpack(_U64, body, at)
+    if at + _U64.size + size + _U32.size > len(body):
+        raise RecordError
+    return title, media_type, at + _U64.size, at + _U64.size + size
+
+
+def attachment_name(body: memoryview) -> str:
+    """The name of an attachment, which need not be whole behind it."""
+    return name(_sized(body, _SIZES.size)[0])
+
+
+def metadata_name(body: memoryview) -> str:
+    """The name of a metadata record, likewise."""
+    return name(_sized(body, 0)[0])
+
+
+def read_attachment(body: memoryview) -> tuple[str, str, int, int, memoryview]:
+    """Name, media type, log time, time of creation (ns) and data of an attachment."""
+    log_ns, create_ns = _unpack(_SIZES, body)
+    title, media_type, start, stop = _attachment_parts(body)
+    return name(title), name(media_type), log_ns, create_ns, body[start:stop]
+
+
+def attachment_crc(body: memoryview) -> tuple[int, int]:
+    """The checksum that an attachment states, 0 for none, and the one that it has."""
+    stop = _attachment_parts(body)[3]
+    return _unpack(_U32, body, stop)[0], crc32(body[:stop])
+
+
+def read_metadata(body: memoryview) -> tuple[str, dict[str, str]]:
+    """Name and texts of a metadata record."""
+    title, at = _sized(body, 0)
+    entries, _ = _sized(body, at)
+    values, at = {}, 0
+    while at < len(entries):
+        key, at = _sized(entries, at)
+        value, at = _sized(entries, at)
+        values[text(key)] = text(value)
+    return name(title), values
+
+
+def read_attachment_index(body: memoryview) -> tuple[int, str]:
+    """Place and name of an attachment, by its index."""
+    (offset,) = _unpack(_U64, body)
+    return offset, name(_sized(body, 5 * _U64.size)[0])
+
+
+def read_metadata_index(body: memoryview) -> tuple[int, str]:
+    """Place and name of a metadata record, by its index."""
+    (offset,) = _unpack(_U64, body)
+    return offset, name(_sized(body, _SIZES.size)[0])
+
+
+def read_extra_counts(body: memoryview) -> tuple[int, int]:
+    """How many attachments and metadata records the statistics count."""
+    _, _, _, attachments, metadata, _, _, _ = _unpack(_STATISTICS, body)
+    return attachments, metadata
+
+
 # ---------------------------------------------------------------------------------- chunks
 
 

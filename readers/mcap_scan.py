@@ -80,8 +80,8 @@ class Scan:
 
     def _step(self, at: int) -> int:
         """Take what lies at `at`; where the next record begins."""
-        opcode, end = self._head(at)
-        if opcode == Opcode.MESSAGE and self._leads_on(end):
+        opcode, end = self.head(at)
+        if opcode == Opcode.MESSAGE and self.leads_on(end):
             if self.run_start >= 0 and end - self.run_start > RUN_BYTES:
                 self._end_run(at)
             self.run_start = at if self.run_start < 0 else self.run_start
@@ -91,21 +91,21 @@ class Scan:
             return self._footer(at, end)
         if opcode == Opcode.CHUNK:
             return self._chunk(at, end)
-        if opcode and self._leads_on(end) and self._take(at, opcode, end):
+        if opcode and self.leads_on(end) and self._take(at, opcode, end):
             return end
-        if not opcode and self.view[at] in UNDEFINED and end <= self.size and self._leads_on(end):
+        if not opcode and self.view[at] in UNDEFINED and end <= self.size and self.leads_on(end):
             self._undefined(at, end)
             return end
         return self._passed_over(at)
 
-    def _head(self, at: int) -> tuple[int, int]:
+    def head(self, at: int) -> tuple[int, int]:
         """Kind and end of the record at `at`; kind 0 where none can be."""
         if at + HEAD.size > self.size:
             return 0, self.size
         opcode, length = HEAD.unpack_from(self.view, at)
         return (opcode if known(opcode, length) else 0), at + HEAD.size + length
 
-    def _leads_on(self, at: int) -> bool:
+    def leads_on(self, at: int) -> bool:
         """Whether at `at` the file ends or another record can begin, be it cut."""
         if at >= self.size:
             return at == self.size
@@ -114,9 +114,9 @@ class Scan:
         if self.view[at] == 0:  # a power loss leaves zeros
             zeros = self.view[at : at + ZEROS_BYTES]
             return zeros == bytes(len(zeros))
-        opcode, end = self._head(at)
+        opcode, end = self.head(at)
         if not opcode and self.view[at] in UNDEFINED:
-            return end <= self.size and (end == self.size or bool(self._head(end)[0]))
+            return end <= self.size and (end == self.size or bool(self.head(end)[0]))
         return bool(opcode) or self.view[at : at + len(MAGIC)] == MAGIC
 
     def _take(self, at: int, opcode: int, end: int) -> bool:
@@ -159,7 +159,7 @@ class Scan:
         """The end of one file; where another one begins that was joined to it."""
         end = at + FOOTER.size - len(MAGIC)
         if self.view[end : end + len(MAGIC)] != MAGIC:
-            if end + len(MAGIC) <= self.size and not self._leads_on(end):
+            if end + len(MAGIC) <= self.size and not self.leads_on(end):
                 return self._passed_over(at)
             return self.size
         self.closed = True
@@ -199,14 +199,14 @@ class Scan:
             return self._passed_over(at)
         self.chunked = True
         inner = at + HEAD.size + head.stop
-        if end <= self.size and inner <= end and self._leads_on(end):
+        if end <= self.size and inner <= end and self.leads_on(end):
             self._block(at, end)
             return end
-        if inner <= self.size and self._leads_on(inner):
+        if inner <= self.size and self.leads_on(inner):
             self.log.report(Cause.LIMIT, "the length of a chunk record is wrong; the chunk's own served", at, at)
             self._block(at, inner)
             return inner
-        if end > self.size and inner > self.size and self._search(at + 1, chunks_only=True) < 0:
+        if end > self.size and inner > self.size and self.search(at + 1, chunks_only=True) < 0:
             count = self._block(at, self.size, torn=True)
             text = f"the file ends inside a chunk, {count} messages of which are read without a checksum"
             self.log.report(Cause.CUT, text, at, self.size)
@@ -221,7 +221,8 @@ class Scan:
             stated = Stated(head.compression, head.stop - head.start, head.unpacked_bytes)
         block = McapBlock(start, end - start, 0, 0, {}, torn, segment=self.segment, chunk=chunk, stated=stated)
         unpacked = self.log.unpack(block)
-        self.log.told.add(start)
+        if unpacked.faults:
+            self.log.told.add(start)
         if unpacked.withheld:
             counts, times = self._listed(end)
             self.cost.update(counts)
@@ -268,7 +269,7 @@ class Scan:
         """What the message indexes that begin at `at` list: messages by channel, first and last log time."""
         counts: Counter[Channel] = Counter()
         times: list[int] = []
-        while (head := self._head(at))[0] == Opcode.MESSAGE_INDEX and head[1] <= self.size:
+        while (head := self.head(at))[0] == Opcode.MESSAGE_INDEX and head[1] <= self.size:
             try:
                 number, entries = read_message_index(self.view[at + HEAD.size : head[1]])
             except RecordError:
@@ -283,16 +284,16 @@ class Scan:
 
     def _passed_over(self, at: int) -> int:
         """Report what lies between `at` and the next record, and go on there."""
-        found = self._search(at + 1)
+        found = self.search(at + 1)
         end = found if found >= 0 else self.size
         if not self.closed or found >= 0:
-            cut = found < 0 and self._head(at)[0]
+            cut = found < 0 and self.head(at)[0]
             self.log.report(Cause.CUT, "the file ends inside a record" if cut else _UNREADABLE, at, end)
         if self.view[end : end + len(MAGIC)] == MAGIC and end + len(MAGIC) < self.size:
             return self._joined(end)
         return end
 
-    def _search(self, start: int, *, chunks_only: bool = False) -> int:
+    def search(self, start: int, *, chunks_only: bool = False) -> int:
         """The first place from `start` on from which several records follow each other, -1 if there is none."""
         if 0 <= self.magic < start:
             self.magic = self.log.find(MAGIC, start)
@@ -311,14 +312,14 @@ class Scan:
 
     def _begins(self, at: int) -> bool:
         """Whether records follow each other from `at` on, the first of which can be parsed."""
-        opcode, end = self._head(at)
+        opcode, end = self.head(at)
         if end > self.size:
             return False
         body = self.view[at + HEAD.size : end]
         try:
             if opcode == Opcode.CHUNK:
                 head = read_chunk_head(body)
-                return head.stop <= len(body) and self._leads_on(end)
+                return head.stop <= len(body) and self.leads_on(end)
             if opcode in (Opcode.SCHEMA, Opcode.CHANNEL):
                 (read_schema if opcode == Opcode.SCHEMA else read_channel)(body)
             elif opcode == Opcode.MESSAGE_INDEX:
@@ -330,7 +331,7 @@ class Scan:
         for _ in range(CHAIN):
             if end == self.size or self.view[end : end + len(MAGIC)] == MAGIC:
                 return True
-            opcode, end = self._head(end)
+            opcode, end = self.head(end)
             if not opcode or end > self.size:
                 return False
         return True

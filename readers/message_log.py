@@ -11,7 +11,7 @@ import bz2
 import heapq
 import re
 import threading
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
 from dataclasses import dataclass, field
 from functools import partial
 from pathlib import Path
@@ -21,6 +21,8 @@ import lz4.frame  # type: ignore[import-untyped, unused-ignore]
 import zstandard
 from isal.isal_zlib import crc32 as crc32
 
+from readers.extras import Extras
+from readers.index_cache import Entry, State, StateError
 from readers.salvage import Loss
 from readers.streams import Damage
 
@@ -34,6 +36,10 @@ HARMLESS_BYTES = 2**24
 
 class DamagedBlockError(Exception):
     """Stored bytes that cannot be unpacked; the text is a clause that says why."""
+
+
+class MessageError(Exception):
+    """A message, or the definition of one, that cannot be used; the text is a clause that says why."""
 
 
 @dataclass(eq=False, slots=True)
@@ -134,15 +140,33 @@ class MessageLog(abc.ABC):
         damage: what was found to be damaged so far.
         losses: the same in the form that can be counted, of the readers that know it.
         notes: choices that the reader made, one sentence each.
+        cached: where the index of the file is kept; None if it is not to be.
     """
 
-    def __init__(self, path: Path, form: str) -> None:
+    def __init__(self, path: Path, form: str, cached: Entry | None = None) -> None:
         self.path = path
         self.format = form
         self.channels: list[Channel] = []
         self.damage: list[Damage] = []
         self.losses: list[Loss] = []
         self.notes: list[str] = []
+        self.cached = cached
+
+    def recall(self, put: Callable[[State], None]) -> bool:
+        """Give what is kept of the file to `put`; whether there was something that it took."""
+        if self.cached is None or (state := self.cached.load()) is None:
+            return False
+        try:
+            put(state)
+        except StateError as error:
+            self.cached.reject(str(error))
+            return False
+        return True
+
+    def keep(self, state: Callable[[], State | None], taken_s: float) -> None:
+        """Keep what took `taken_s` seconds to find, if that was long; `state` gives it, None if it cannot be kept."""
+        if self.cached is not None and self.cached.worth(taken_s) and (found := state()) is not None:
+            self.cached.save(found)
 
     def lose(self, loss: Loss) -> None:
         """Note a loss, once."""
@@ -159,6 +183,10 @@ class MessageLog(abc.ABC):
     def count_before(self, channels: Collection[Channel], stop_ns: int) -> int:
         """How many messages of `channels` were logged before `stop_ns`."""
         return sum(1 for source in self.sources(channels, None, stop_ns) for _ in source.open())
+
+    def extras(self) -> Extras:
+        """What the log holds beside its messages; what of it cannot be read becomes a loss."""
+        return Extras()
 
     @abc.abstractmethod
     def close(self) -> None:
@@ -189,8 +217,8 @@ class Block:
 class IndexedLog(MessageLog):
     """A log whose messages lie in blocks, of each of which it is known what it holds."""
 
-    def __init__(self, path: Path, form: str) -> None:
-        super().__init__(path, form)
+    def __init__(self, path: Path, form: str, cached: Entry | None = None) -> None:
+        super().__init__(path, form, cached)
         self._blocks: list[Block] = []
 
     @abc.abstractmethod
@@ -297,5 +325,10 @@ def text(raw: Buffer) -> str:
 
 
 def name(raw: Buffer) -> str:
-    """Decode a name; control characters come out as backslash escapes too, so that it can be shown anywhere."""
-    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), text(raw))
+    """Decode a name, `escaped`."""
+    return escaped(text(raw))
+
+
+def escaped(given: str) -> str:
+    """A name whose control characters are backslash escapes, so that it can be shown anywhere."""
+    return _CONTROL.sub(lambda found: found[0].encode("unicode_escape").decode(), given)

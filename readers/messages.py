@@ -19,6 +19,7 @@ import numpy as np
 from readers.clock import sane_stamp
 from readers.decoding import MessageError
 from readers.images import RAW_FORMATS, image_header, is_depth
+from readers.message_log import escaped
 from readers.streams import (
     UNKNOWN_COV3,
     UNKNOWN_COV6,
@@ -142,8 +143,9 @@ def frame_of(message: Any) -> str:
 
 
 def plain_frame(name: Any) -> str:
-    """A frame's name without the leading slash of old tf."""
-    return str(name).lstrip("/")
+    """A frame's name without the leading slash of old tf, `escaped`."""
+    frame = str(name).lstrip("/")
+    return frame if frame.isprintable() else escaped(frame)
 
 
 # ------------------------------------------------------------------------------ small parts
@@ -259,13 +261,22 @@ def image_sample(
 
 def compressed_image(message: Any, arrival: Arrival) -> ImageSample:
     """sensor_msgs/CompressedImage and foxglove.CompressedImage."""
-    payload = _bytes(message.data)
+    stamp = header_stamp(message)
+    own_ns = None if stamp is None else stamp_ns(stamp)
+    return compressed_sample(arrival, own_ns, str(message.format), _bytes(message.data))
+
+
+def compressed_sample(arrival: Arrival, own_ns: int | None, stated: str, payload: bytes | memoryview) -> ImageSample:
+    """An image that `payload` holds in a compressed form, which is `stated`.
+
+    Raises:
+        MessageError: it holds no bytes.
+    """
     if not payload:
         raise MessageError("the image holds no bytes")
-    stated = str(message.format)
     encoding, width, height = (stated, 0, 0) if is_depth(stated) else image_header(payload)
     return ImageSample(
-        **arrival.stamps(header_stamp(message)),
+        **arrival.stamps_ns(own_ns),
         encoding=encoding or stated_format(stated),
         payload=payload,
         width_px=width,
@@ -290,19 +301,48 @@ def camera_info(message: Any, arrival: Arrival) -> CameraInfo:
     def numbers(name: str) -> Any:
         return getattr(message, name) if hasattr(message, name) else getattr(message, name.lower())
 
-    distortion = np.array(numbers("D"), dtype=np.float64).reshape(-1)
-    distortion.setflags(write=False)
-    camera = Camera(
-        width_px=int(message.width),
-        height_px=int(message.height),
-        matrix=_matrix(numbers("K"), 3, 3),
-        distortion_model=_distortion_model(message.distortion_model, distortion),
-        distortion=distortion,
-        rectification=_matrix(numbers("R"), 3, 3),
-        projection=_matrix(numbers("P"), 3, 4),
-        frame=frame_of(message),
+    stamp = header_stamp(message)
+    return camera_sample(
+        arrival,
+        None if stamp is None else stamp_ns(stamp),
+        frame_of(message),
+        int(message.width),
+        int(message.height),
+        message.distortion_model,
+        *(numbers(name) for name in "DKRP"),
     )
-    return CameraInfo(**arrival.stamps(header_stamp(message)), camera=camera)
+
+
+def camera_sample(
+    arrival: Arrival,
+    own_ns: int | None,
+    frame: str,
+    width_px: int,
+    height_px: int,
+    model: str,
+    distortion: Any,
+    matrix: Any,
+    rectification: Any,
+    projection: Any,
+) -> CameraInfo:
+    """Intrinsics; the numbers are in any form, D [n], K [9], R [9] and P [12] row by row.
+
+    Raises:
+        MessageError: they have other lengths.
+    """
+    coefficients = np.array(distortion, dtype=np.float64).reshape(-1)
+    coefficients.setflags(write=False)
+    camera = Camera(
+        width_px=width_px,
+        height_px=height_px,
+        matrix=_matrix(matrix, 3, 3),
+        distortion_model=_distortion_model(model, coefficients),
+        distortion=coefficients,
+        rectification=_matrix(rectification, 3, 3),
+        projection=_matrix(projection, 3, 4),
+        frame=frame,
+    )
+    return CameraInfo(**arrival.stamps_ns(own_ns), camera=camera)
 
 
 def _distortion_model(stated: str, distortion: FloatArray) -> str:
@@ -401,13 +441,28 @@ def pose(message: Any, arrival: Arrival) -> PoseSample:
     inner, covariance = message.pose, UNKNOWN_COV6
     if hasattr(inner, "covariance"):
         inner, covariance = inner.pose, _covariance6(inner.covariance)
-    quat = _quaternion(inner.orientation, arrival)
+    stamp = header_stamp(message)
+    own_ns = None if stamp is None else stamp_ns(stamp)
+    position_m, quat = _vector(inner.position), _xyzw(inner.orientation)
+    return pose_sample(arrival, own_ns, frame_of(message), position_m, quat, covariance)
+
+
+def pose_sample(
+    arrival: Arrival,
+    own_ns: int | None,
+    frame: str,
+    position_m: FloatArray,
+    quat: FloatArray,
+    covariance: FloatArray = UNKNOWN_COV6,
+) -> PoseSample:
+    """A pose in a frame."""
+    quat = _unit(quat, arrival)
     return PoseSample(
-        **arrival.stamps(header_stamp(message)),
-        position_m=_vector(inner.position),
+        **arrival.stamps_ns(own_ns),
+        position_m=position_m,
         quat_xyzw=quat,
         covariance=covariance,
-        parent_frame=frame_of(message),
+        parent_frame=frame,
     )
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import mmap
 import struct
+import time
 from bisect import bisect_left
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
@@ -25,7 +26,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from readers.ahead import WORTH_A_THREAD_S, Ahead, settle
-from readers.message_log import Buffer, Channel, DamagedBlockError, Message, MessageLog, Source, inflate, text
+from readers.index_cache import Entry, State
+from readers.index_states import Ros1Found, put_ros1, ros1_state
+from readers.message_log import Buffer, Channel, DamagedBlockError, Message, MessageLog, Source, escaped, inflate, text
 from readers.salvage import Cause, Loss, Tally
 from readers.streams import RecordingError
 
@@ -325,8 +328,8 @@ class Ros1Log(MessageLog):
         RecordingError: no bag of format 2.0, or an encrypted one.
     """
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, "ROS 1 bag 2.0")
+    def __init__(self, path: Path, cached: Entry | None = None) -> None:
+        super().__init__(path, "ROS 1 bag 2.0", cached)
         with path.open("rb") as file:
             self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self._data = memoryview(self._map)
@@ -339,6 +342,16 @@ class Ros1Log(MessageLog):
         self._running: set[Future[Any]] = set()
         if self._data[: len(MAGIC)] != MAGIC:
             raise RecordingError(path, "it is no ROS 1 bag of format 2.0", "check that the file is complete")
+        if not self.recall(self._put):
+            begun = time.perf_counter()
+            self._open()
+            found = Ros1Found(self._by_id, self._chunks, self._told)
+            self.keep(lambda: ros1_state(self, found), time.perf_counter() - begun)
+
+    def _put(self, state: State) -> None:
+        self._by_id, self._chunks, self._told = put_ros1(self, state, self._size)
+
+    def _open(self) -> None:
         header = self._bag_header()
         records, infos = self._walk(len(MAGIC) if header is None else header.stop)
         if header is not None:
@@ -443,8 +456,8 @@ class Ros1Log(MessageLog):
         """
         number, described = record.u32(b"conn"), fields_of(data[record.start : record.stop])
         channel = Channel(
-            topic=text(record.fields.get(b"topic", b"")),
-            type=text(described.get(b"type", b"")),
+            topic=escaped(text(record.fields.get(b"topic", b""))),
+            type=escaped(text(described.get(b"type", b""))),
             encoding="ros1",
             schema_encoding="ros1msg",
             schema=described.get(b"message_definition", b""),

@@ -17,6 +17,7 @@ from readers.message_log import Buffer, text
 
 _U32 = struct.Struct("<I")
 _HEADER = struct.Struct("<IIII")
+_STAMP_BYTES = 12
 _SIZE = struct.Struct("<II")
 _ROW = struct.Struct("<BII")
 _IMU = struct.Struct("<37d")
@@ -131,7 +132,7 @@ def _text(data: Buffer, at: int) -> tuple[str, int]:
 
 def _header(data: Buffer) -> tuple[Header, int]:
     seq, sec, nanosec, _ = _HEADER.unpack_from(data)
-    frame, at = _text(data, 12)
+    frame, at = _text(data, _STAMP_BYTES)
     return Header(seq, Stamp(sec, nanosec), frame), at
 
 
@@ -140,6 +141,26 @@ def _numbers(form: struct.Struct, data: Buffer, at: int) -> tuple[float, ...]:
     if at + form.size != len(data):
         raise WireError
     return form.unpack_from(data, at)
+
+
+def imu_numbers_at(data: Buffer) -> int | None:
+    """Where the numbers of sensor_msgs/Imu begin; None if they do not fill the rest of the message."""
+    return _numbers_at(data, texts=1, count=37)
+
+
+def odometry_numbers_at(data: Buffer) -> int | None:
+    """Where the numbers of nav_msgs/Odometry begin; None if they do not fill the rest of the message."""
+    return _numbers_at(data, texts=2, count=85)
+
+
+def _numbers_at(data: Buffer, texts: int, count: int) -> int | None:
+    """Where `count` numbers begin that fill a message behind its stamp and some texts."""
+    at = _STAMP_BYTES
+    for _ in range(texts):
+        if at + _U32.size > len(data):
+            return None
+        at += _U32.size + _U32.unpack_from(data, at)[0]
+    return at if at + 8 * count == len(data) else None
 
 
 def imu(data: Buffer) -> Imu:

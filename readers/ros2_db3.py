@@ -13,6 +13,7 @@ import mmap
 import re
 import shutil
 import sqlite3
+import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from functools import partial
@@ -21,7 +22,9 @@ from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
 from urllib.parse import quote
 
-from readers.message_log import Channel, Message, MessageLog, Source
+from readers.index_cache import Entry
+from readers.index_states import Counted, db3_counted, db3_state
+from readers.message_log import Channel, Message, MessageLog, Source, escaped
 from readers.salvage import Cause, Loss, Tally
 from readers.sqlite_pages import BrokenRowError, Pages, Row
 from readers.streams import RecordingError
@@ -48,13 +51,14 @@ class SqliteLog(MessageLog):
         RecordingError: no database of a ROS 2 bag, or one of which nothing can be read.
     """
 
-    def __init__(self, path: Path) -> None:
-        super().__init__(path, "ROS 2 bag, sqlite3")
+    def __init__(self, path: Path, cached: Entry | None = None) -> None:
+        super().__init__(path, "ROS 2 bag, sqlite3", cached)
         self._by_id: dict[int, Channel] = {}
         self._copy: TemporaryDirectory[str] | None = None
         self._readable = path
         self._pages: Pages | None = None
         self._found: list[Found] = []
+        self._table = "messages"
         self._size = path.stat().st_size
         self._database = self._connect()
         try:
@@ -83,9 +87,10 @@ class SqliteLog(MessageLog):
         )
         return sqlite3.connect(self._readable, check_same_thread=False)
 
+    _SUM = "sum(timestamp % 1000003 * (id % 1009))"
     _COUNT = (
         "SELECT topic_id, typeof(timestamp) = 'integer', data IS NULL, count(*),"
-        " min(timestamp), max(timestamp) FROM messages GROUP BY 1, 2, 3"
+        f" min(timestamp), max(timestamp), {_SUM} FROM messages GROUP BY 1, 2, 3"
     )
 
     def _cut(self) -> str:
@@ -104,12 +109,15 @@ class SqliteLog(MessageLog):
             return
         try:
             self._read_tables()
-            counted = list(self._database.execute(self._COUNT))
+            counted, fault = self._counts()
         except (sqlite3.DatabaseError, UnicodeDecodeError, TypeError) as error:
             self._read_pages(str(error), listed=False)
             return
+        if fault:
+            self._read_pages(fault, listed=False)
+            return
         strangers = 0
-        for number, timed, empty, count, first_ns, last_ns in counted:
+        for number, timed, empty, count, first_ns, last_ns, _ in counted:
             channel = self._by_id.get(number)
             if channel is None:
                 strangers += count
@@ -120,6 +128,46 @@ class SqliteLog(MessageLog):
             else:
                 channel.count, channel.first_ns, channel.last_ns = count, first_ns, last_ns
         self._judge_strangers(strangers)
+
+    def _index_fault(self, messages: int, total: int) -> str:
+        """Compare the index of times with the table: its number of `messages`, and their `total` by `_SUM`.
+
+        An index that differs is not used; one that has more messages than the table is a fault of that, told in words.
+        """
+        listed = self._database.execute("SELECT name FROM pragma_index_list('messages') WHERE NOT partial")
+        columns = "SELECT name FROM pragma_index_info(?)"
+        names = [n for (n,) in list(listed) if [c for (c,) in self._database.execute(columns, (n,))] == ["timestamp"]]
+        for index in names:
+            quoted = index.replace('"', '""')
+            try:
+                query = f'SELECT count(*), {self._SUM} FROM messages INDEXED BY "{quoted}"'
+                count, found = self._database.execute(query).fetchone()
+            except sqlite3.DatabaseError:
+                count, found = 0, None
+            if count > messages:
+                return f"the index of times names {count} messages, the table holds {messages}"
+            if (count, found or 0) != (messages, total):
+                self._table = "messages NOT INDEXED"
+                self._harm(Cause.ORDER, "the index of times differs from the messages, which are read without it")
+        return ""
+
+    def _counts(self) -> tuple[Counted, str]:
+        """What `_COUNT` gives, and the fault of the index of times; "" for none.
+
+        Both take a pass over all rows, so the answer is kept, but not of an index that differs from the table, nor
+        where a log lies beside.
+        """
+        found: Counted = []
+        if self._copy is not None:
+            self.cached = None
+        if self.recall(lambda state: found.extend(db3_counted(state))):
+            return found, ""
+        begun = time.perf_counter()
+        found = list(self._database.execute(self._COUNT))
+        fault = self._index_fault(sum(row[3] for row in found), sum(row[-1] or 0 for row in found))
+        if not fault and self._table == "messages":
+            self.keep(lambda: db3_state(found), time.perf_counter() - begun)
+        return found, fault
 
     def _judge_strangers(self, count: int) -> None:
         if count:
@@ -141,8 +189,13 @@ class SqliteLog(MessageLog):
     def _describe(self, topics: Iterable[tuple[Any, ...]], definitions: dict[str, tuple[str, str]]) -> None:
         for number, topic, kind, encoding in topics:
             schema_encoding, schema = definitions.get(kind, ("", ""))
-            channel = Channel(str(topic), str(kind), str(encoding), str(schema_encoding), str(schema).encode())
-            self._by_id[number] = channel
+            self._by_id[number] = Channel(
+                topic=escaped(str(topic)),
+                type=escaped(str(kind)),
+                encoding=escaped(str(encoding)),
+                schema_encoding=escaped(str(schema_encoding)),
+                schema=str(schema).encode(),
+            )
         self.channels = list(self._by_id.values())
 
     # -------------------------------------------------------------------------------- reading
@@ -166,7 +219,7 @@ class SqliteLog(MessageLog):
         """A query for messages of some topics in a range of time; the plain one lets SQLite skip other rows soonest."""
         which = "" if len(numbers) == len(self._by_id) else f"topic_id IN ({', '.join('?' * len(numbers))}) AND "
         return (
-            f"SELECT {columns} FROM messages WHERE {which}timestamp >= ? AND timestamp < ?"
+            f"SELECT {columns} FROM {self._table} WHERE {which}timestamp >= ? AND timestamp < ?"
             " AND typeof(timestamp) = 'integer' AND data IS NOT NULL"
         )
 

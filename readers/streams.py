@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 if TYPE_CHECKING:
+    from readers.extras import Extras
     from readers.salvage import Loss
 
 FloatArray = NDArray[np.float64]
@@ -364,7 +365,8 @@ class ReadOptions:
     topic and what is added to the times of its samples. `cameras` are the files of calibrations that take the place of
     the recording's own; `scale_cameras` has calibrations of another image size scaled to the images. Definitions that a
     log does not have come from the ROS 2 `distribution` (``humble``; the latest if empty), then from the ``.msg`` files
-    of `msg_folder`.
+    of `msg_folder`. `cache` allows a log without a usable index to be opened by what an earlier opening found, see
+    `readers.index_cache`.
     """
 
     rate_hz: float | None = None
@@ -377,6 +379,7 @@ class ReadOptions:
     scale_cameras: bool = False
     distribution: str = ""
     msg_folder: Path | None = None
+    cache: bool = True
 
     def clock_of(self, topic: str) -> Clock:
         """The clock of a topic."""
@@ -493,6 +496,17 @@ class Recording(abc.ABC):
         """The damage in the form that can be counted by topic, of logs of messages."""
         return ()
 
+    @property
+    def cache_troubles(self) -> tuple[str, ...]:
+        """What was wrong with the cache of indexes, one sentence each; the recording is the same without it."""
+        return ()
+
+    def extras(self) -> Extras:
+        """Attachments and metadata of the log; reading them may find damage."""
+        from readers.extras import Extras
+
+        return Extras()
+
     @abc.abstractmethod
     def read(
         self,
@@ -520,6 +534,39 @@ class Recording(abc.ABC):
             StreamError: as for `read`.
         """
         return self.read(streams)
+
+    def array(self, stream: str, start_ns: int | None = None, stop_ns: int | None = None) -> NDArray[np.void]:
+        """The samples of a stream as one structured array, a row for each, in the order of `read`.
+
+        Its columns are those of `readers.sample_arrays`: times in ns, and the fields of the samples with their units in
+        their names. A message that cannot be made a sample has a row with ``readable`` False and NaN. The array is as
+        large as what was asked for; `arrays` gives the same rows piece by piece.
+
+        Args:
+            stream: one of numbers: IMU, odometry, poses, ranges, GNSS, scalars.
+            start_ns: first `t_ns`, None from the begin.
+            stop_ns: end of the half-open range, None to the end.
+
+        Raises:
+            StreamError: as for `read`; or the samples are no rows of numbers, or a time does not fit into 64 bits.
+        """
+        from readers.sample_arrays import joined, row_type
+
+        columns = row_type(self.stream(stream))
+        return joined(self.arrays(stream, start_ns, stop_ns), columns)
+
+    def arrays(
+        self, stream: str, start_ns: int | None = None, stop_ns: int | None = None, *, rows: int = 1 << 12
+    ) -> Iterator[NDArray[np.void]]:
+        """The same rows as `array`, in pieces of about `rows` of them, so that memory is bounded.
+
+        Raises:
+            StreamError: as for `array`.
+        """
+        from readers.sample_arrays import arrays_of, row_type
+
+        columns = row_type(self.stream(stream))
+        return arrays_of(self.read([stream], start_ns, stop_ns), columns, rows)
 
     @property
     def identity(self) -> str:

@@ -1,11 +1,8 @@
-"""MCAP files cut and flipped at every byte, and mutated at random: what no reader may do with them.
+"""MCAP files cut and flipped at every byte: what no reader may do with them.
 
-``python tests/mcap_mutations.py [seconds]`` runs every cut and every flip of a log per codec, then random mutations
-for so many seconds (30), and prints the figures.
+``python tests/mcap_mutations.py`` runs every cut and every flip of a log per codec, and prints the figures.
 """
 
-import random
-import sys
 import tempfile
 import time
 from collections import Counter
@@ -58,9 +55,8 @@ def judged(path: Path, small: Small, data: bytes, *, torn: bool = False) -> str:
         return "refused"
     except Exception as error:
         return f"raised {type(error).__name__}: {error}"
-    unverified = any("without a checksum" in loss.text for loss in losses)
     if not set(found) <= set(small.keys):
-        return "flagged wrong data" if unverified and not torn else "WRONG DATA"
+        return "WRONG DATA"
     if Counter(found) != Counter(small.keys) and not losses:
         return "SILENT LOSS"
     if torn and not losses:
@@ -81,49 +77,20 @@ def flips(small: Small, step: int = 1, start: int = 8) -> Iterator[bytes]:
         yield bytes(changed)
 
 
-def mutations(small: Small, seed: int, seconds: float) -> Iterator[bytes]:
-    """Up to four changes each: bytes changed, removed, doubled, zeroed or set to the ends of their range."""
-    rng, end = random.Random(seed), time.monotonic() + seconds
-    while time.monotonic() < end:
-        changed = bytearray(small.data)
-        for _ in range(rng.randint(1, 4)):
-            at, size = rng.randrange(8, len(changed)), rng.choice((1, 1, 2, 4, 8, 64, 500))
-            action = rng.randrange(5)
-            if action == 0:
-                changed[at] = rng.randrange(256)
-            elif action == 1:
-                del changed[at : at + size]
-            elif action == 2:
-                changed[at:at] = changed[at : at + size]
-            elif action == 3:
-                changed[at : at + size] = bytes(len(changed[at : at + size]))
-            else:
-                changed[at : at + size] = b"\xff" * len(changed[at : at + size])
-            if len(changed) < 20:
-                break
-        yield bytes(changed)
-
-
 def outcomes(path: Path, small: Small, files: Iterable[bytes], *, torn: bool = False) -> Counter[str]:
     return Counter(judged(path, small, data, torn=torn) for data in files)
 
 
-def main(seconds: float) -> None:
+def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "a.mcap"
         for codec in CODECS:
             small = small_log(path, codec)
-            for name, files in (
-                ("cuts", cuts(small)),
-                ("flips", flips(small)),
-                ("mutations", mutations(small, 1, seconds / len(CODECS))),
-            ):
+            for name, files in (("cuts", cuts(small)), ("flips", flips(small))):
                 begun = time.monotonic()
                 found = outcomes(path, small, files, torn=name == "cuts")
-                print(
-                    f"{codec:5} {name:10} {found.total():6} files in {time.monotonic() - begun:5.1f} s: {dict(found)}"
-                )
+                print(f"{codec:5} {name:5} {found.total():6} files in {time.monotonic() - begun:5.1f} s: {dict(found)}")
 
 
 if __name__ == "__main__":
-    main(float(sys.argv[1]) if len(sys.argv) > 1 else 30.0)
+    main()

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from bad_bags import DB3_CASES, MESSAGES, ROS1_CASES, Case, entries
+from bad_bags import DB3_CASES, MESSAGES, ROS1_CASES, Case, entries, few_entries
 from made_logs import ROS1, ROS2, write_ros1, write_ros2
 
 from readers import open_recording
@@ -109,15 +109,14 @@ def test_no_bad_log_costs_much_time_or_memory(tmp_path: Path) -> None:
         assert mebibytes < MEBIBYTES
 
 
-# -------------------------------------------------------------------------- every byte, and at random
+# ------------------------------------------------------------------------------------- every byte
 
 
 def small(folder: Path, kind: str) -> Path:
     """A log of a few kB in three chunks, or one database."""
-    few = [entry for entry in entries(ROS2 if kind == "db3" else ROS1) if entry.topic != "/odom"][:33]
     if kind == "db3":
-        return write_ros2(folder / "small", few) / "small.db3"
-    return write_ros1(folder / "small.bag", few, kind, 4000)
+        return write_ros2(folder / "small", few_entries(ROS2)) / "small.db3"
+    return write_ros1(folder / "small.bag", few_entries(ROS1), kind, 4000)
 
 
 KINDS = ("none", "lz4", "bz2", "db3")
@@ -168,37 +167,13 @@ def test_a_flipped_bit_gives_nothing_false_where_the_container_can_tell(tmp_path
         found, reported = judge.read(bytes(data))
         false = found - judge.every
         wrong += bool(false)
+        if kind == "bz2":  # what a topic is called also stands outside of the chunks, and is told if it differs
+            assert {message[1:] for message in found} <= {message[1:] for message in judge.every}, place
         if not reported and found != judge.every:
             silent += 1
             assert kind != "bz2", place
-            assert {message[:2] for message in found} == judge.outlines or kind == "db3", place
-    if kind == "bz2":
-        assert wrong <= 0.01 * len(places)
+            if kind == "db3":  # topics and types are texts without a checksum
+                assert [m[1] for m in sorted(found)] == [m[1] for m in sorted(judge.every)], place
+            else:
+                assert {message[:2] for message in found} == judge.outlines, place
     print(f"{kind}: {len(places)} flips, {wrong} with wrong data, {silent} unreported")
-
-
-@pytest.mark.parametrize("kind", KINDS)
-def test_random_mutations_raise_nothing_of_others(tmp_path: Path, kind: str) -> None:
-    judge, rng = Judge(tmp_path, kind), random.Random(20)
-    for _ in range(2000 if WHOLE else 30):
-        data = bytearray(judge.whole)
-        for _ in range(rng.randrange(1, 6)):
-            mutate(data, rng)
-        judge.read(bytes(data))
-
-
-def mutate(data: bytearray, rng: random.Random) -> None:
-    """One change: random bytes, an extreme number, a stretch of zeros, moved, doubled or gone."""
-    at = rng.randrange(len(data))
-    size = min(rng.choice((1, 2, 4, 8, 100, 1000)), len(data) - at)
-    change = rng.randrange(5)
-    if change == 0:
-        data[at : at + size] = rng.randbytes(size)
-    elif change == 1:
-        data[at : at + 4] = rng.choice((b"\xff\xff\xff\xff", b"\0\0\0\0", b"\xff\xff\xff\x7f", b"\0\0\0\x80"))
-    elif change == 2:
-        data[at : at + size] = bytes(size)
-    elif change == 3:
-        data[at:at] = data[at : at + size]
-    elif len(data) > size + 20:
-        del data[at : at + size]

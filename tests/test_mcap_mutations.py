@@ -1,19 +1,12 @@
-"""Cuts, flips and random mutations of MCAP files; all of them: ``python tests/mcap_mutations.py``.
-
-WORKBENCH_EVERY_BYTE=1 tries every byte, WORKBENCH_FUZZ_S sets the seconds of the random mutations, WORKBENCH_FUZZ_SEED
-their seed.
-"""
+"""Cuts and flips of MCAP files; WORKBENCH_EVERY_BYTE=1 tries every byte."""
 
 import os
 from pathlib import Path
 
 import pytest
-from mcap_mutations import CODECS, Small, cuts, flips, mutations, outcomes, small_log
+from mcap_mutations import CODECS, Small, cuts, flips, outcomes, small_log
 
 STEP = 1 if os.environ.get("WORKBENCH_EVERY_BYTE") else 29
-FUZZ_S = float(os.environ.get("WORKBENCH_FUZZ_S", "5"))
-SEED = int(os.environ.get("WORKBENCH_FUZZ_SEED", "1"))
-FINE = {"", "reported loss", "refused", "flagged wrong data"}
 
 
 @pytest.fixture(scope="module", params=CODECS)
@@ -31,12 +24,6 @@ def test_every_flip_gives_only_what_was_written_and_no_loss_is_silent(tmp_path: 
     found = outcomes(tmp_path / "a.mcap", small, flips(small, STEP))
     assert set(found) <= {"", "reported loss"}
     assert found[""] > 0.2 * found.total()
-
-
-def test_random_mutations_raise_nothing_and_lose_nothing_silently(tmp_path: Path, small: Small) -> None:
-    found = outcomes(tmp_path / "a.mcap", small, mutations(small, SEED, FUZZ_S / len(CODECS)))
-    assert set(found) <= FINE, found
-    assert found.total() > 5
 
 
 def test_the_judge_sees_wrong_data_and_silent_loss(tmp_path: Path, small: Small) -> None:

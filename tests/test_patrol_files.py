@@ -286,8 +286,6 @@ def test_a_plan_is_flown_in_simulation_and_found_covered(tmp_path: Path, capsys:
 
 def test_a_real_flight_is_mapped(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
     photos = RECORDINGS / "drone_nadir_caliterra_a"
-    if not photos.is_dir():
-        pytest.skip("the shared recordings are not here")
     words = ("patrol", "evaluate", photos, "--fov", "69.1x54.6", "--pixels", 4000)
     assert run(*words) == 2
     assert "--ground" in capsys.readouterr().err

@@ -832,7 +832,6 @@ PAIRS = RECORDINGS / "stereo_chessboard"
 NUMBERS = [n for n in range(1, 15) if n != 10]
 PRINTED = BoardSettings(square_m=0.025, landmarks="all", first="light")
 SIDES = ("left", "right")
-needs_pairs = pytest.mark.skipif(not PAIRS.is_dir(), reason="shared recordings not found")
 
 
 @functools.cache
@@ -871,13 +870,11 @@ def stereo(cameras: dict[str, Camera]) -> float:
     return float(np.linalg.norm(together[6]))
 
 
-@needs_pairs
 def test_every_real_board_is_found() -> None:
     for side in SIDES:
         assert [len(corners) for corners in real_corners(side)] == [54] * 13
 
 
-@needs_pairs
 def test_real_boards_with_the_calibrations_that_came_with_them() -> None:
     """Those of the file `intrinsics.yml` do not fit its images well: its left lens is off by 1 to 3 px."""
     storage = [
@@ -891,7 +888,6 @@ def test_real_boards_with_the_calibrations_that_came_with_them() -> None:
     assert np.median(baselines(cameras)) == pytest.approx(stereo(cameras), rel=0.04)
 
 
-@needs_pairs
 def test_real_boards_with_a_calibration_by_their_own_corners() -> None:
     board = [chessboard_points(PRINTED).astype(np.float32)] * len(NUMBERS)
     cameras = {}

@@ -262,6 +262,38 @@ def test_errors_are_one_line(capsys: pytest.CaptureFixture[str], tmp_path: Path)
     assert "max_landmarks" in capsys.readouterr().out
 
 
+CAMERA_YAML = """image_width: 640
+image_height: 480
+camera_matrix: {rows: 3, cols: 3, data: [500, 0, 319.5, 0, 500, 239.5, 0, 0, 1]}
+distortion_model: plumb_bob
+distortion_coefficients: {rows: 1, cols: 5, data: [0, 0, 0, 0, 0]}
+"""
+
+
+def test_a_calibration_for_images_of_another_size_is_refused_or_scaled(
+    capsys: pytest.CaptureFixture[str], tmp_path: Path
+) -> None:
+    """The images are 64 x 48 px; those that are only shown may be small copies, of which it is said."""
+    log, camera = str(tmp_path / "b.mcap"), tmp_path / "camera.yaml"
+    camera.write_text(CAMERA_YAML, encoding="utf-8")
+    small = ("--set", "duration_s=0.4", "--set", "front.width_px=64", "--set", "front.height_px=48")
+    assert main(["simulate", "paper-b", "-o", log, *small]) == 0
+    replay = ["replay", log, "-e", "range", "--camera", str(camera), "-o", str(tmp_path / "out"), "--json"]
+    capsys.readouterr()
+    assert main([*replay, "--set", "landmarks=corners"]) == 2
+    (problem,) = [line for line in capsys.readouterr().err.splitlines() if "calibration is for" in line]
+    assert (
+        "b.mcap: /front/image_raw/compressed: the calibration is for 640 x 480 px, but the images are 64 x 48 px"
+        in problem
+    )
+    assert "--scale-camera" in problem
+    assert main([*replay, "--set", "landmarks=corners", "--scale-camera"]) in (0, 1, 3)
+    assert "is scaled to 64 x 48 px" in json.dumps(json.loads(capsys.readouterr().out))
+    assert main([*replay, "--image", "/front/image_raw/compressed"]) in (0, 1, 3)
+    shown = "but the images are 64 x 48 px of /front/image_raw/compressed, which are only shown"
+    assert shown in json.dumps(json.loads(capsys.readouterr().out))
+
+
 # --------------------------------------------------------------------------- boards, late images
 
 

@@ -20,8 +20,9 @@ from pipelines.ranging.filter import Status
 from pipelines.verdict import Severity, Verdict
 from workbench import cli, report
 from workbench.diagnosis.finding import Evidence, Finding
+from workbench.judgement import Drift
 from workbench.report import curves, markup, plots
-from workbench.report.facts import Drift, commands, length, trials
+from workbench.report.facts import commands, length, trials
 from workbench.report.pictures import pictures
 from workbench.runs import Run, open_run
 from workbench.session import Request, run

@@ -28,9 +28,10 @@ from pipelines.ranging.step import RangeStep
 from pipelines.semidirect.baseline_step import BaselineStep
 from pipelines.semidirect.step import SemidirectStep
 from pipelines.verdict import Severity, Verdict
-from readers.streams import ImageSample, RecordingError, WorkbenchError
+from readers.streams import ImageSample, RecordingError, ScalarSample, WorkbenchError
 from workbench import rrd, traces
 from workbench.blueprints import blueprint_of
+from workbench.rrd_reading import chunks
 from workbench.schema import CORRELATION, SCHEMAS
 
 HALF_STEP = 2.0**-11  # half the distance of float16 numbers just below 2
@@ -415,6 +416,27 @@ def test_events_stand_where_the_verdict_changes(tmp_path: Path, monkeypatch: pyt
     alarms = rows_of(path, f"{root}/alarms", "TextLog:text")
     assert len(alarms) == 1 + 20 + 6
     assert alarms[130][0].startswith("NOT_RIGID, PEAK_AMBIGUOUS: ")
+
+
+def test_the_lag_of_log_time_after_the_stamps_is_a_series(tmp_path: Path) -> None:
+    """Of the samples that have a stamp: 5 ms, 7 ms and one that came before its stamp."""
+    path, second = tmp_path / "sensors.rrd", 1_000_000_000
+    with rrd.SensorWriter(path, recording_id="mission") as writer:
+        for k, lag_ms in enumerate((5, 7, None, -2)):
+            t_ns = (k + 1) * second
+            own = -1 if lag_ms is None else t_ns
+            received_ns = t_ns + 1_000_000 * (lag_ms or 0)
+            sample = ScalarSample(stream="/h", t_ns=t_ns, received_ns=received_ns, header_ns=own, value=1.0)
+            writer.sample(sample, sample)
+        writer.sample(*[ScalarSample(stream="/bare", t_ns=second, received_ns=second, value=2.0)] * 2)
+    rows = {}
+    for chunk in chunks(path, "/sensors/clocks/h"):
+        batch = chunk.to_record_batch()
+        times = (moment.value for moment in batch.column("sensor_time").to_pylist())
+        rows |= dict(zip(times, batch.column("Scalars:scalars").to_pylist(), strict=True))
+    assert rows == {second: [5.0], 2 * second: [7.0], 4 * second: [-2.0]}
+    assert "/sensors/clocks/bare" not in entities(path)
+    assert "Log time after stamp, ms" in view_names(path)
 
 
 def test_the_tables_show_the_matrices() -> None:

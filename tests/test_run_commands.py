@@ -3,6 +3,8 @@
 import json
 import math
 import shutil
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
@@ -134,6 +136,18 @@ def test_a_frame_is_explained_alike_by_a_sample_and_by_the_whole_run(
     assert part.neighbours[0].frame == whole.neighbours[0].frame
     told = [{q.field: repr(q.values) for q in one.quantities} for one in (part, whole)]
     assert told[0] == told[1]
+
+
+def test_explain_loads_no_library_that_it_does_not_need(best: Run) -> None:
+    judged(best)  # the diagnosis needs some of them, its conclusion does not
+    code = (
+        "import sys; from workbench.cli import main; main(sys.argv[1:]);"
+        "print({'numba', 'pandas', 'scipy', 'pyarrow.compute'} & set(sys.modules), file=sys.stderr)"
+    )
+    command = [sys.executable, "-c", code, "explain", str(best.file), "--frame", "25"]
+    done = subprocess.run(command, capture_output=True, text=True, check=True)
+    assert "frame 25" in done.stdout
+    assert done.stderr.splitlines()[-1] == "set()"
 
 
 def test_findings_of_the_frame_and_only_those_are_told(best: Run) -> None:

@@ -181,6 +181,36 @@ def test_the_motion_of_an_image_is_what_it_was_moved_by(turn: float, x: float, y
     np.testing.assert_allclose(found.shift_px, rotation @ centre - centre + (x, y), atol=0.1)
 
 
+@pytest.mark.parametrize(("turn", "x", "y"), [(0.0, 0.0, 18.0), (0.06, 5.0, -12.0), (-0.1, -9.0, 3.0)])
+def test_the_motion_of_a_plane_that_is_seen_obliquely_is_that_at_the_images_centre(
+    turn: float, x: float, y: float
+) -> None:
+    """The ground by a camera that is 35 degrees off the vertical: no similarity fits, and the answer is exact."""
+    size, ground = (200, 160), np.array([[1, 0, 450], [0, 1, 450], [0, 0, 1.0]])
+    lens = np.array([[150, 0, 99.5], [0, 150, 79.5], [0, 0, 1.0]])
+    tilt = cv2.Rodrigues(np.array([0.6, 0.0, 0.0]))[0]
+    scale = np.diag([1, 1, 150.0])  # the ground lies 150 of its pixels away
+
+    def seen_after(angle: float, dx: float, dy: float) -> NDArray[np.float64]:
+        moved = np.array([[np.cos(angle), -np.sin(angle), dx], [np.sin(angle), np.cos(angle), dy], [0, 0, 1]])
+        return np.asarray(lens @ tilt @ scale @ moved @ np.linalg.inv(ground))
+
+    def picture(mapping: NDArray[np.float64]) -> NDArray[np.uint8]:
+        return np.asarray(cv2.warpPerspective(GROUND, mapping, size), np.uint8)
+
+    first, second = seen_after(0.0, 0.0, 0.0), seen_after(turn, x, y)
+    found = image_motion(picture(first), picture(second))
+    mapping = second @ np.linalg.inv(first)
+
+    def at(u: float, v: float) -> NDArray[np.float64]:
+        place = mapping @ (u, v, 1.0)
+        return np.asarray(place[:2] / place[2])
+
+    across, down = at(100.0, 79.5) - at(99.0, 79.5), at(99.5, 80.0) - at(99.5, 79.0)
+    np.testing.assert_allclose(found.shift_px, at(99.5, 79.5) - (99.5, 79.5), atol=0.1)
+    assert found.turn_rad == pytest.approx(np.arctan2(across[1] - down[0], across[0] + down[1]), abs=2e-3)
+
+
 def test_images_without_texture_or_of_other_sizes_tell_no_motion() -> None:
     flat = np.full((160, 200), 90, np.uint8)
     assert image_motion(flat, flat) == UNKNOWN
@@ -223,3 +253,30 @@ def test_a_simulated_missions_clock_offset_and_late_images_are_found(
     assert status == 0
     assert told["offset_ms"] == pytest.approx(-65.0, abs=max(5.0, 4 * told["sigma_ms"]))
     assert told["sigma_ms"] < 10
+
+
+TURNS = "legs = [{turn_rad=0.7,turn_s=1.2},{drive_m=0.5},{turn_rad=-1.1,turn_s=1.7},{turn_rad=0.5,turn_s=0.9}]"
+POSTERS = "[[8,-8,1],[9,-4,1],[9,0,1],[9,4,1],[8,8,1],[7,-6,2.5],[8,-2,2.5],[8,2,2.5],[7,6,2.5]]"
+GROUND_AHEAD = "[ground]\nmetres_per_px = 0.004"
+FORWARD = "focal_px = 120\nwidth_px = 160\nheight_px = 120\ntiming = { rate_hz = 20, clock_offset_s = 0.035 }"
+TILTED = "focal_px = 110\nwidth_px = 160\nheight_px = 160\ntiming = { rate_hz = 25, clock_offset_s = 0.035 }"
+VIEWS = {
+    "straight ahead": f'curve = "line"\n{TURNS}\n{GROUND_AHEAD}\n[front]\n{FORWARD}',
+    "down, tilted": f'curve = "serpentine"\nspeed_kmh = 4.0\n[camera]\npitch_rad = -0.5\n{TILTED}',
+}
+
+
+@pytest.mark.parametrize("name", VIEWS)
+def test_the_clock_of_a_camera_that_does_not_look_straight_down_is_found(
+    name: str, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Its clock is 35 ms ahead of the IMU's."""
+    file = tmp_path / "view.toml"
+    sensors = f"[imu]\ntiming = {{ rate_hz = 200 }}\n[surroundings]\nposter_m = 1.5\nlandmarks_m = {POSTERS}\n"
+    file.write_text(f'about = "{name}"\nduration_s = 5\n[trajectory]\n{VIEWS[name]}\n{sensors}')
+    status = main(["sync", str(file), "--json"])
+    (told,) = json.loads(capsys.readouterr().out)["pairs"]
+    assert status == 0
+    assert told["offset_ms"] == pytest.approx(-35.0, abs=min(4 * told["sigma_ms"], 5.0))
+    assert told["sigma_ms"] < 4.0
+    assert told["signals"].endswith("turn about z")

@@ -102,7 +102,7 @@ def sensor_blueprint(bounds: Bounds) -> rrb.Blueprint:
             _image("/camera/image", bounds.image_px, "Image"),
             rrb.Vertical(
                 _map("", bounds.extent),
-                rrb.TextDocumentView(origin="/recording/facts", name="Recording"),
+                rrb.Tabs(rrb.TextDocumentView(origin="/recording/facts", name="Recording"), _lags(bounds.frames)),
                 row_shares=[3, 2],
             ),
         ),
@@ -179,7 +179,7 @@ def correlation_blueprint(run: str, estimator: str = "correlation", bounds: Boun
                 _image(f"{root}/search/surface", bounds.surfaces_px, "Correlation surfaces"),
                 _map(run, bounds.extent),
             ),
-            rrb.Horizontal(_plots(root, bounds.frames), _texts(run, root), column_shares=[3, 2]),
+            rrb.Horizontal(_plots(root, bounds.frames), _texts(run, root, _lags(bounds.frames)), column_shares=[3, 2]),
             rrb.StateTimelineView(origin=root, contents=[f"{root}/verdict", f"{root}/verdicts/**"], name="Verdicts",
                                   time_view=_axis(bounds.frames)),
             row_shares=[10, 8, 7],
@@ -212,7 +212,7 @@ def range_blueprint(run: str, estimator: str = "range", bounds: Bounds | None = 
             rrb.Horizontal(
                 rrb.StateTimelineView(origin=root, contents=[f"{root}/verdict", f"{root}/verdicts/**"],
                                       name="Verdicts", time_view=_axis(bounds.frames)),
-                _texts(run, root, rrb.TextDocumentView(origin=f"{root}/slots", name="Slots")),
+                _texts(run, root, rrb.TextDocumentView(origin=f"{root}/slots", name="Slots"), _lags(bounds.frames)),
                 column_shares=[2, 3],
             ),
             row_shares=[18, 7],
@@ -233,6 +233,12 @@ _ONE = (  # of one landmark: entity, name
     ("parallax", "Parallax: derotated blue, raw grey; to the focus orange, px"),
     ("gain", "Gain K (xx blue, yy orange, ξx green, ξy red)"),
 )
+
+
+def _lags(frames: tuple[int, int] | None) -> rrb.TimeSeriesView:
+    """How late log time is after the stamps of each stream; of others than the frames by `sensor_time`."""
+    name = "Log time after stamp, ms"
+    return rrb.TimeSeriesView(origin="/sensors/clocks", contents="$origin/**", name=name, axis_x=_axis(frames))
 
 
 def _landmark_plots(root: str, bounds: Bounds) -> rrb.Tabs:
@@ -584,7 +590,7 @@ def _plots(root: str, frames: tuple[int, int] | None) -> rrb.Tabs:
     )
 
 
-def _texts(run: str, root: str, *more: rrb.TextDocumentView) -> rrb.Tabs:
+def _texts(run: str, root: str, *more: rrb.View) -> rrb.Tabs:
     columns = rrb.TextLogColumns(text_log_columns=["LogLevel", "Body"])
     return rrb.Tabs(
         rrb.TextDocumentView(origin=f"{root}/numbers", name="Numbers"),

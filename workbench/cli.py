@@ -20,6 +20,7 @@ from typing import TYPE_CHECKING, Annotated, Any, NoReturn
 import typer
 
 from workbench import cli_patrol, cli_runs
+from workbench.options import EstimatorName, PresetName, SettingsFile, StartTime, StopTime, Stride
 from workbench.terminal import (
     FAULT,
     IN_PART,
@@ -39,6 +40,7 @@ from workbench.terminal import (
 
 if TYPE_CHECKING:
     from pipelines.simulation.mission import SimulatedMission
+    from readers.extras import Extras, LostExtra
     from readers.streams import Camera, CameraFile, Clock, ReadOptions, Recording, StreamInfo
     from workbench.diagnosis.finding import Finding
     from workbench.reproduce import report as reports_a
@@ -110,6 +112,9 @@ MsgFolder = Annotated[
 Distribution = Annotated[
     str, typer.Option("--distro", metavar="NAME", help="ROS 2 distribution of types that the log does not define.")
 ]
+NoCache = Annotated[
+    bool, typer.Option("--no-cache", help="Walk over a log without an index anew; see docs/readers.md.")
+]
 AsJson = Annotated[bool, typer.Option("--json", help="Print one JSON object on stdout.")]
 
 
@@ -147,16 +152,29 @@ def inspect(
     scale_camera: ScaleCamera = False,
     msg: MsgFolder = None,
     distro: Distribution = "",
+    no_cache: NoCache = False,
 ) -> None:
     """Show what is in a recording: streams, cameras, damage, and what is odd about its clocks."""
     from workbench.session import open_any
 
     options = _options(
-        rate, times, times_unit, tf, clocks, offsets, cameras, scale_camera, msg=msg, distribution=distro
+        rate,
+        times,
+        times_unit,
+        tf,
+        clocks,
+        offsets,
+        cameras,
+        scale_camera,
+        msg=msg,
+        distribution=distro,
+        cache=not no_cache,
     )
     with open_any(path, options) as recording:
+        _warn(recording.cache_troubles)
         facts, clocks_found = ([], {}) if quick else _survey(recording)
-        values = _recording_values(recording, facts) | {"clocks": clocks_found} | _lost(recording, quick)
+        beside = {} if quick else _extras_values(recording.extras())
+        values = _recording_values(recording, facts) | {"clocks": clocks_found} | beside | _lost(recording, quick)
         if as_json:
             print_json(values)
         else:
@@ -173,6 +191,20 @@ def _lost(recording: Recording, quick: bool) -> dict[str, Any]:
         return {"loss": None}
     good = {} if quick else loss_report.read_through(recording)
     return {"loss": loss_report.values(good, recording.losses)}
+
+
+def _extras_values(extras: Extras) -> dict[str, Any]:
+    """What lies in a log beside its messages."""
+    attachments = [
+        {"name": one.name, "media_type": one.media_type, "bytes": len(one.data), "log_ns": one.log_ns}
+        for one in extras.attachments
+    ]
+    metadata = [{"name": one.name, "values": one.values} for one in extras.metadata]
+    return {"attachments": attachments, "metadata": metadata, "lost_beside_messages": _lost_extras(extras.lost)}
+
+
+def _lost_extras(lost: Sequence[LostExtra]) -> list[dict[str, str]]:
+    return [{"kind": str(one.kind), "name": one.name, "reason": one.reason} for one in lost]
 
 
 def _survey(recording: Recording) -> tuple[list[dict[str, Any]], dict[str, Any]]:
@@ -257,6 +289,9 @@ def _print_recording(recording: Recording, values: Mapping[str, Any]) -> None:
     _print_clocks(values["clocks"])
     print_list("notes", values["notes"])
     print_list("not readable", [_unreadable(info) for info in recording.streams if not info.readable])
+    beside = [f"{one['name']}, {one['media_type']}, {one['bytes']} bytes" for one in values.get("attachments", ())]
+    print_list("attachments", beside)
+    print_list("metadata", [f"{one['name']}: {len(one['values'])} values" for one in values.get("metadata", ())])
     print_list("damage", values["damage"])
     if values["loss"]:
         _print_losses(values["loss"])
@@ -324,6 +359,7 @@ def recover(
     out: Annotated[Path, typer.Option("--out", "-o", metavar="OUT.mcap", help="File to write; it must not exist.")],
     msg: MsgFolder = None,
     distro: Distribution = "",
+    no_cache: NoCache = False,
     as_json: AsJson = False,
 ) -> None:
     """Write the readable messages of a log, as they are stored, into an MCAP file with an index; tell what was lost.
@@ -335,10 +371,9 @@ def recover(
     from workbench.recovery import recover as write
     from workbench.session import Progress, open_any
 
-    with (
-        open_any(path, _options(None, None, "auto", None, msg=msg, distribution=distro)) as recording,
-        Bar(out.name, "message") as bar,
-    ):
+    options = _options(None, None, "auto", None, msg=msg, distribution=distro, cache=not no_cache)
+    with open_any(path, options) as recording, Bar(out.name, "message") as bar:
+        _warn(recording.cache_troubles)
         try:
             done = write(recording, out, on_progress=lambda done, total: bar(Progress(done, total, 0)))
         except KeyboardInterrupt:
@@ -347,11 +382,16 @@ def recover(
     report = loss_report.values(done.good, done.losses)
     skipped = [{"topic": topic, "count": n, "reason": why} for (topic, why), n in done.skipped.items()]
     if as_json:
-        print_json({"path": str(out), **report, "damage": list(done.damage), "not_written": skipped})
+        counts = {"attachments": done.attachments, "metadata": done.metadata}
+        beside = counts | {"lost_beside_messages": _lost_extras(done.lost)}
+        print_json({"path": str(out), **report, **beside, "damage": list(done.damage), "not_written": skipped})
     else:
-        print(f"{out}: {sum(good.count for good in done.good.values())} messages of {shown(str(path))}")
+        counts = {"attachments": done.attachments, "records of metadata": done.metadata}
+        more = "".join(f", {count} {what}" for what, count in counts.items() if count)
+        print(f"{out}: {sum(good.count for good in done.good.values())} messages{more} of {shown(str(path))}")
         _print_losses(report)
-        print_list("not written", [f"{one['topic']}: {one['count']} messages: {one['reason']}" for one in skipped])
+        not_written = [f"{one['topic']}: {one['count']} messages: {one['reason']}" for one in skipped]
+        print_list("not written", [*not_written, *(f"{one.kind} {one.name}: {one.reason}" for one in done.lost)])
         print_list("damage", done.damage)
     if not done.clean:
         raise typer.Exit(IN_PART)
@@ -383,19 +423,15 @@ def _print_losses(report: Mapping[str, Any]) -> None:
 )
 def replay(
     path: RecordingPath,
-    estimator: Annotated[str, typer.Option("--estimator", "-e", help="Name of the estimator.")] = "correlation",
-    preset: Annotated[str | None, typer.Option(help="Preset of its settings, such as best or paper-a.")] = None,
-    settings: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="Settings over the preset: TOML, JSON, or a RUN.toml.")
-    ] = None,
+    estimator: EstimatorName = "correlation",
+    preset: PresetName = None,
+    settings: SettingsFile = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting over all; repeatable.")
     ] = None,
-    start: Annotated[
-        str | None, typer.Option("--from", metavar="T", help="Begin: seconds after the first frame, ns, or ISO 8601.")
-    ] = None,
-    stop: Annotated[str | None, typer.Option("--to", metavar="T", help="End (excluded), likewise.")] = None,
-    stride: Annotated[int, typer.Option(help="Use every n-th frame.")] = 1,
+    start: StartTime = None,
+    stop: StopTime = None,
+    stride: Stride = 1,
     out: Annotated[
         Path | None, typer.Option("--out", "-o", metavar="DIR", help="Folder of the results [results/NAME].")
     ] = None,
@@ -444,6 +480,7 @@ def replay(
     scale_camera: ScaleCamera = False,
     msg: MsgFolder = None,
     distro: Distribution = "",
+    no_cache: NoCache = False,
     as_json: AsJson = False,
 ) -> None:
     """Replay a recording through an estimator; write all it computed, and a summary.
@@ -474,7 +511,17 @@ def replay(
         reference_offset_s=reference_offset,
         height=height,
         options=_options(
-            rate, times, times_unit, tf, clocks, offsets, cameras, scale_camera, msg=msg, distribution=distro
+            rate,
+            times,
+            times_unit,
+            tf,
+            clocks,
+            offsets,
+            cameras,
+            scale_camera,
+            msg=msg,
+            distribution=distro,
+            cache=not no_cache,
         ),
         calibrate=calibrate,
         smooth=smooth,
@@ -514,7 +561,7 @@ def _replay(request: Request, recording: Recording | None = None) -> Outcome:
 
 
 def _warn(texts: Sequence[str]) -> None:
-    """Tell what is odd about the clocks before the estimator runs."""
+    """Tell what is odd about the clocks, or the cache of indexes, before the work begins."""
     for text in texts:
         print(f"warning: {shown(text)}", file=sys.stderr, flush=True)
 
@@ -606,7 +653,7 @@ def simulate(
     show: Annotated[bool, typer.Option("--show", help="Print it with all keys, a TOML file to start from.")] = False,
     replayed: Annotated[bool, typer.Option("--replay", help="Replay it without a file in between.")] = False,
     estimator: Annotated[str, typer.Option("--estimator", "-e", help="Estimator of --replay.")] = "correlation",
-    preset: Annotated[str | None, typer.Option(help="Preset of its settings, such as best or paper-a.")] = None,
+    preset: PresetName = None,
     as_json: AsJson = False,
 ) -> None:
     """Make a simulated mission: write it as a recording, or replay it directly.
@@ -766,14 +813,13 @@ def sync(
     sensors: Annotated[
         list[str] | None, typer.Option("--with", metavar="TOPIC", help="IMU or odometry [all]; repeatable.")
     ] = None,
-    start: Annotated[
-        str | None, typer.Option("--from", metavar="T", help="Begin: seconds after the first frame, ns, or ISO 8601.")
-    ] = None,
-    stop: Annotated[str | None, typer.Option("--to", metavar="T", help="End (excluded), likewise.")] = None,
+    start: StartTime = None,
+    stop: StopTime = None,
     max_offset: Annotated[float, typer.Option(metavar="S", help="How far the clocks may be apart.")] = 1.0,
     picture: Annotated[Path | None, typer.Option(metavar="FILE.png", help="Draw the correlations.")] = None,
     clocks: Clocks = None,
     offsets: Offsets = None,
+    no_cache: NoCache = False,
     as_json: AsJson = False,
 ) -> None:
     """Tell by how much the times of each camera are to be moved to fit each IMU and odometer, and how surely.
@@ -788,7 +834,9 @@ def sync(
 
     if not 0 < max_offset < float("inf"):
         raise StreamError(f"--max-offset {max_offset:g}: give a positive number of seconds")
-    with open_any(path, _options(None, None, "auto", None, clocks, offsets)) as recording, Bar("sync") as bar:
+    options = _options(None, None, "auto", None, clocks, offsets, cache=not no_cache)
+    with open_any(path, options) as recording, Bar("sync") as bar:
+        _warn(recording.cache_troubles)
         pairs = estimated(
             recording,
             images=images or (),
@@ -1202,6 +1250,7 @@ def _options(
     *,
     msg: Path | None = None,
     distribution: str = "",
+    cache: bool = True,
 ) -> ReadOptions:
     from readers.streams import ReadOptions, StreamError
 
@@ -1226,6 +1275,7 @@ def _options(
         scale_cameras=scale_camera,
         distribution=distribution,
         msg_folder=msg,
+        cache=cache,
     )
 
 

@@ -1,4 +1,4 @@
-"""The commands about finished runs: explain, compare, report, check, sweep, export.
+"""The commands about finished runs: explain, consistency, compare, report, check, sweep, export.
 
 `workbench.cli` takes them up; what is said there of output and exit statuses holds here, and one more: 4, an
 expectation of ``check`` is not met.
@@ -16,6 +16,7 @@ from typing import TYPE_CHECKING, Annotated, Any
 
 import typer
 
+from workbench.options import EstimatorName, PresetName, SettingsFile, StartTime, StopTime, Stride
 from workbench.terminal import (
     IN_PART,
     INTERRUPTED,
@@ -34,11 +35,15 @@ from workbench.terminal import (
 if TYPE_CHECKING:
     from workbench.check import Checked
     from workbench.compare import Comparison, Parting
+    from workbench.consistency import Consistency
     from workbench.diagnosis.finding import Finding
     from workbench.explain import Explanation, Quantity
+    from workbench.judgement import Judgement
     from workbench.runs import Run
 
 LINE = 110
+EXPLAINED = 0.5
+"""One error counts as the source of the loops' drift where it explains that share of it."""
 MOST_ODD = 14
 ERRORS = ("x_m", "y_m", "distance_m", "heading_rad")
 COMPARED = (
@@ -61,6 +66,7 @@ def add_to(app: typer.Typer) -> None:
     """Register the commands of this module."""
     for command, short, lines in (
         (explain, "Why a frame is as it is: a screenful about it.", EXPLAIN),
+        (consistency, "What a run says of its own drift, without a reference.", CONSISTENCY),
         (compare, "Runs side by side, and where they part.", COMPARE),
         (report, "Make a page that tells what a run concluded, what failed, and why.", REPORT),
         (check, "Hold runs against expectations, for CI.", CHECK),
@@ -95,8 +101,9 @@ def explain(
 ) -> None:
     """Explain frames: verdict, every intermediate with its unit, what is unusual in this run, neighbours, findings.
 
-    Without a choice it is the worst frame: the one that did the most harm where there is a reference, else the one of
-    the gravest verdict. How unusual a number is, is told in robust standard deviations (σ) from the run's median.
+    Without a choice it is the worst frame: the one that did the most harm where a reference or the command consistency
+    tells it, else the one of the gravest verdict. How unusual a number is, is told in robust standard deviations (σ)
+    from the run's median.
     """
     from workbench.explain import explain as explained
     from workbench.judgement import judged
@@ -107,12 +114,13 @@ def explain(
     frames = _chosen_frames(opened, frame, at, worst, judgement.harm_m)
     told = [explained(opened, number, findings=judgement.findings, harm_m=judgement.harm_m) for number in frames]
     if as_json:
-        print_json({"run": str(opened.file), "frames": [_explanation_values(one) for one in told]})
+        about = {"run": str(opened.file), "harm_from": judgement.harm_from, "note": judgement.note}
+        print_json({**about, "frames": [_explanation_values(one) for one in told]})
     elif not told:
         print(f"{shown(str(opened.file))}: no frame of this run is out of the ordinary")
     for number, one in enumerate(told if not as_json else ()):
         print("\n" + "=" * LINE if number else "", end="\n" if number else "")
-        _print_explanation(opened, one)
+        _print_explanation(opened, one, judgement)
     if open_viewer and told:
         _open_at(opened, told[0])
 
@@ -121,7 +129,6 @@ def _chosen_frames(run: Run, frame: int | None, at: str | None, worst: int | Non
     """The frames that are asked for."""
     from readers.streams import WorkbenchError
     from workbench.explain import worst_frames
-    from workbench.inputs import parse_time
 
     if sum(choice is not None for choice in (frame, at, worst)) > 1:
         raise WorkbenchError("give one of --frame, --time and --worst")
@@ -129,6 +136,8 @@ def _chosen_frames(run: Run, frame: int | None, at: str | None, worst: int | Non
         run.row_of(frame)
         return [frame]
     if at is not None:
+        from workbench.inputs import parse_time
+
         t_ns, first, last = parse_time(at, int(run.t_ns[0])), int(run.t_ns[0]), int(run.t_ns[-1])
         if not first <= t_ns <= last:
             raise WorkbenchError(f"--time {at}: the run lasts from 0 to {(last - first) / 1e9:.3f} s ({moment(first)})")
@@ -136,9 +145,10 @@ def _chosen_frames(run: Run, frame: int | None, at: str | None, worst: int | Non
     return worst_frames(run, worst or 1, harm_m)
 
 
-def _print_explanation(run: Run, one: Explanation) -> None:
+def _print_explanation(run: Run, one: Explanation, judgement: Judgement) -> None:
     """A screenful."""
     from workbench.explain import NOT_JUDGED, brief, number, unit_of
+    from workbench.judgement import WHOLES
 
     print(
         f"frame {one.frame} of {shown(str(run.file))} ({shown(one.estimator)}), {one.since_start_s:.3f} s after its "
@@ -152,7 +162,9 @@ def _print_explanation(run: Run, one: Explanation) -> None:
         x, y, distance, heading = one.error
         print(f"error against the reference: {distance:.4g} m (x {x:+.4g}, y {y:+.4g}), {math.degrees(heading):+.4g}°")
     if math.isfinite(one.harm_m):
-        print(f"harm: this frame adds {one.harm_m:+.4g} m to the error at the end")
+        print(f"harm: this frame adds {one.harm_m:+.4g} m to {WHOLES[judgement.harm_from]}")
+    if judgement.note:
+        print(f"harm: not told: {shown(judgement.note)}")
     for finding in one.findings:
         print(f"finding {finding.rule} ({_spans(finding.spans)}): {shown(finding.sentence)}")
         print(f"  cause: {shown(finding.cause)}\n  try: {shown(finding.remedy)}")
@@ -274,6 +286,95 @@ def _open_at(run: Run, one: Explanation) -> None:
         print("There is no display here: open the run on a machine with one, with workbench view.", file=sys.stderr)
         return
     raise typer.Exit(show_at(files_of([run.file]), one.frame))
+
+
+# ---------------------------------------------------------------------------- consistency
+
+
+CONSISTENCY = (
+    "workbench consistency results/mission",
+    "workbench consistency results/mission/best.rrd --worst 20",
+    "workbench consistency results/mission --json | jq .loops[0]",
+)
+
+
+def consistency(
+    run: RunPath,
+    worst: Annotated[int, typer.Option("--worst", metavar="K", min=1, help="How many frames and loops to print.")] = 8,
+    as_json: AsJson = False,
+) -> None:
+    """Hold a run against itself: replay it backward, and look again at the places that its path came back to.
+
+    Needs no reference and no original log. Frames whose motion the backward replay does not undo are named, the one
+    that moves the end the furthest first. What both replays have alike, such as a wrong scale, stays unseen. The answer
+    is kept in RUN.consistency.json; explain and report take the harm of frames from it where there is no reference.
+    """
+    from workbench.consistency import consistency as held
+    from workbench.consistency import values_of, write
+    from workbench.judgement import judged
+    from workbench.runs import open_run
+
+    opened = open_run(run)
+    with Bars() as bars:
+        found = held(opened, bars)
+    file = write(opened, found)
+    if as_json:
+        print_json({**values_of(found), "file": str(file)})
+    else:
+        _print_consistency(opened, found, judged(opened).findings, worst)
+        print(f"\nwritten      {shown(str(file))}")
+
+
+def _print_consistency(run: Run, found: Consistency, findings: Sequence[Finding], worst: int) -> None:
+    from workbench.explain import number
+
+    unit, share = found.unit, 100 * found.end_m / found.path_m if found.path_m > 0 else math.nan
+    print(
+        f"backward     the two replays end {number(found.end_m)} {unit} apart, {number(share)} % of the path, "
+        f"turned by {number(math.degrees(found.end_rad))}°"
+    )
+    print(f"             the median frame moves the end by {number(found.usual_m)} {unit}; those that move it most:\n")
+    heads = ("frame", f"by, {unit}", "of the median", "verdict", "finding")
+    print("\n".join(table(heads, _frame_rows(run, found, findings, worst), right=(0, 1, 2))))
+    print(f"\nloops        {_loops_line(found)}")
+    if found.loops:
+        rows = [
+            (f"{one.first_frame} – {one.second_frame}", number(one.loop_m), number(one.drift_m),
+             number(100 * one.drift_m / one.loop_m), number(math.degrees(one.drift_rad)))
+            for one in found.loops[:worst]
+        ]  # fmt: skip
+        heads = ("frames", f"path, {unit}", f"drift, {unit}", "% of it", "turned, °")
+        print("\n" + "\n".join(table(heads, rows, right=range(1, 5))))
+    if found.suspects:
+        print(f"\n             {_suspicion(found)}")
+
+
+def _suspicion(found: Consistency) -> str:
+    """Where the drift of the loops may come from."""
+    spans, explained = found.suspicion()
+    share = f"{max(0, round(100 * explained))} % of the loops' drift"
+    if explained < EXPLAINED:
+        return f"no single error explains it, the likeliest one {share}: it is spread along the path"
+    return f"one error in {_spans(spans)} would explain {share}; nothing tells more closely where"
+
+
+def _frame_rows(run: Run, found: Consistency, findings: Sequence[Finding], worst: int) -> Iterable[tuple[str, ...]]:
+    from workbench.explain import number
+
+    for row in found.ranked()[:worst].tolist():
+        frame, size = int(found.frame[row]), float(found.size_m[row])
+        times = f"{number(size / found.usual_m)} x" if found.usual_m > 0 else ""
+        named = ", ".join(finding.rule for finding in findings if finding.covers(frame))
+        yield str(frame), number(size), times, str(run.verdicts[run.row_of(frame)].name), named
+
+
+def _loops_line(found: Consistency) -> str:
+    if found.loops_why:
+        return f"not looked for: {found.loops_why}"
+    if not found.revisits:
+        return "the path does not come back to any place"
+    places = f"{found.revisits} place" + "s" * (found.revisits != 1)
+    return f"{places} come back to; at {len(found.loops)} the images tell the motion between the visits"
 
 
 # -------------------------------------------------------------------------------- compare
@@ -533,15 +634,15 @@ def sweep(
         list[str] | None,
         typer.Option("--grid", metavar="KEY=A,B,C", help="A setting (or preset) and its values; repeatable."),
     ] = None,
-    estimator: Annotated[str, typer.Option("--estimator", "-e", help="Name of the estimator.")] = "correlation",
-    preset: Annotated[str | None, typer.Option(help="Preset of its settings.")] = None,
-    settings: Annotated[Path | None, typer.Option(metavar="FILE", help="Settings over the preset.")] = None,
+    estimator: EstimatorName = "correlation",
+    preset: PresetName = None,
+    settings: SettingsFile = None,
     overrides: Annotated[
         list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="One setting of all replays; repeatable.")
     ] = None,
-    start: Annotated[str | None, typer.Option("--from", metavar="T", help="Begin, as replay takes it.")] = None,
-    stop: Annotated[str | None, typer.Option("--to", metavar="T", help="End (excluded).")] = None,
-    stride: Annotated[int, typer.Option(help="Use every n-th frame.")] = 1,
+    start: StartTime = None,
+    stop: StopTime = None,
+    stride: Stride = 1,
     image: Annotated[str | None, typer.Option(metavar="TOPIC", help="Image stream.")] = None,
     reference: Annotated[str | None, typer.Option(metavar="TOPIC", help="Stream to compare with, or none.")] = None,
     height: Annotated[str | None, typer.Option(metavar="TOPIC", help="Stream of the camera's height.")] = None,

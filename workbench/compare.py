@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry import wrap_angles
+from pipelines.planar import wrap_angles
 from readers.streams import RecordingError, WorkbenchError
 from workbench.metrics import metrics
 from workbench.runs import Run

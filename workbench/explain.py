@@ -306,9 +306,10 @@ def _spread(sample: Floats) -> tuple[Floats, Floats]:
     middle, spread = np.full(sample.shape[1], np.nan), np.full(sample.shape[1], np.nan)
     if known.any():
         seen = np.where(np.isfinite(sample[:, known]), sample[:, known], np.nan)
-        middle[known] = np.nanmedian(seen, axis=0)
+        median = np.nanmedian if np.isnan(seen).any() else np.median  # the same, but much quicker
+        middle[known] = median(seen, axis=0)
         off = np.abs(seen - middle[known])
-        mad = 1.4826 * np.nanmedian(off, axis=0)
+        mad = 1.4826 * median(off, axis=0)
         spread[known] = np.where(mad > 0, mad, 1.2533 * np.nanmean(off, axis=0))
     return middle, spread
 

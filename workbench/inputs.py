@@ -406,17 +406,21 @@ def _focal(settings: Any, camera: Camera | None, size_px: tuple[int, int]) -> tu
             "",
             ["the calibration is empty (K has no focal length): give --camera FILE or focal_px"],
         )
-    made_for = (camera.width_px, camera.height_px)
-    if made_for not in (size_px, (0, 0)):
-        note = (
-            f"the calibration is for {made_for[0]} x {made_for[1]} px, but the images are {size_px[0]} x "
-            f"{size_px[1]} px: it is not used; give focal_px, or --scale-camera if the images were resized"
-        )
-        return None, "", [note]
+    if other := other_size(camera, size_px):
+        return None, "", [f"{other}: it is not used; give focal_px, or --scale-camera if the images were resized"]
     notes = [camera_sentence(camera)]
     notes += ["lens distortion is not removed from the images"] if np.any(camera.distortion) else []
     focal = float(camera.matrix[0, 0])
     return focal, f"focal length {focal:.6g} px of {source_of(camera)}", notes
+
+
+def other_size(camera: Camera, size_px: tuple[int, int]) -> str:
+    """That a calibration is for images of another width and height, in words; "" if it is not, or does not say."""
+    made_for = (camera.width_px, camera.height_px)
+    if made_for in (size_px, (0, 0)):
+        return ""
+    (width, height), (actual_width, actual_height) = made_for, size_px
+    return f"the calibration is for {width} x {height} px, but the images are {actual_width} x {actual_height} px"
 
 
 def source_of(camera: Camera) -> str:

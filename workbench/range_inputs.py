@@ -17,6 +17,7 @@ from scipy.spatial.transform import Rotation
 from pipelines.latency import LatencyBuffer
 from pipelines.ranging.inputs import Synchronisation
 from pipelines.simulation.faults import FAULTS_STREAM
+from readers.adjusted import image_size
 from readers.streams import (
     Camera,
     Landmark,
@@ -26,7 +27,17 @@ from readers.streams import (
     StreamKind,
     TextSample,
 )
-from workbench.inputs import NONE, Reference, camera_sentence, choose_images, intrinsics, kinds, names, of_kind
+from workbench.inputs import (
+    NONE,
+    Reference,
+    camera_sentence,
+    choose_images,
+    intrinsics,
+    kinds,
+    names,
+    of_kind,
+    other_size,
+)
 from workbench.inputs import load_reference as load_any_reference
 from workbench.settings import Layer, Resolved, validated
 
@@ -196,6 +207,10 @@ def with_camera(
     """Fill in what the settings leave open of the camera; also say what was filled in.
 
     Only settings that are None are filled in; where `focal_px` was given, none of the intrinsics is.
+
+    Raises:
+        StreamError: neither recording nor settings have intrinsics, or those of the recording are for frames of
+            another size. Images that are only shown may have been resized: of those it is said.
     """
     settings: Any = resolved.settings
     if streams.kind is StreamKind.LANDMARKS:
@@ -211,7 +226,7 @@ def with_camera(
     notes = []
     if settings.focal_px is None:
         values = intrinsics(camera)
-        notes.append(camera_sentence(camera))
+        notes += [camera_sentence(camera), *_size_notes(recording, camera, streams)]
     if np.isfinite(camera.body_t_camera).all():
         turn, place = camera.body_t_camera[:3, :3], camera.body_t_camera[:3, 3]
         values["camera_quat_xyzw"] = tuple(Rotation.from_matrix(turn).as_quat().tolist())
@@ -231,6 +246,20 @@ def with_camera(
     }
     filled = validated(settings, [Layer("the recording", fill)]).settings
     return Resolved(filled, resolved.given), notes
+
+
+def _size_notes(recording: Recording, camera: Camera, streams: Streams) -> list[str]:
+    """What is to be said of a camera that was calibrated for another size than the images have, which it may raise."""
+    images = streams.frames if streams.kind is StreamKind.IMAGE else streams.shown
+    size_px = image_size(recording, images) if images else None
+    if size_px is None or not (other := other_size(camera, size_px)):
+        return []
+    if images != streams.frames:
+        return [f"{other} of {images}, which are only shown"]
+    raise StreamError(
+        f"{recording.path}: {images}: {other}: give --set focal_px=… and --set centre_px=[…, …], or --scale-camera if "
+        "the images were resized"
+    )
 
 
 def _only_surveyed(resolved: Resolved, recording: Recording) -> Resolved:

@@ -1,7 +1,7 @@
 """`recover`: what can be read of a log, written as a clean MCAP file with an index; and the account of both.
 
-Messages pass through as they were stored, with their encoding, their definitions and all their times. Every message
-that the log is known to have held is either written or counted with a reason.
+Messages pass through as they were stored, with their encoding, their definitions and all their times; attachments and
+metadata of MCAP go before them. All that the log is known to have held is either written or counted with a reason.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ from mcap.writer import CompressionType
 from mcap.writer import Writer as McapWriter
 
 from readers.decoding import MessageError, definition_of, unpacked
+from readers.extras import ExtraKind, Extras, LostExtra
 from readers.log_recording import LogRecording
 from readers.message_log import Channel, Message
 from readers.salvage import Loss
@@ -26,6 +27,7 @@ from workbench.writers.door import uninterrupted
 Progress = Callable[[int, int], None]
 CHUNK_BYTES = 1 << 20
 LARGEST_TIME_NS = 2**64 - 1
+LARGEST_ATTACHMENT_BYTES = 1 << 28
 LIBRARY = "estimator-workbench"
 PROFILES = {"ros1": "ros1", "cdr": "ros2"}
 
@@ -35,7 +37,7 @@ class Recovered:
     """What became of a log.
 
     `good` counts by topic what was written; `skipped` by topic and reason the messages that could be read and that
-    the new file cannot hold.
+    the new file cannot hold. `attachments` and `metadata` count those that were written, `lost` are the others.
     """
 
     path: Path
@@ -43,11 +45,14 @@ class Recovered:
     skipped: Mapping[tuple[str, str], int]
     losses: tuple[Loss, ...]
     damage: tuple[str, ...]
+    attachments: int = 0
+    metadata: int = 0
+    lost: tuple[LostExtra, ...] = ()
 
     @property
     def clean(self) -> bool:
-        """Whether nothing was damaged and every message was written."""
-        return not self.damage and not self.skipped
+        """Whether nothing was damaged and everything was written."""
+        return not (self.damage or self.skipped or self.lost)
 
 
 def recover(recording: Recording, path: Path, *, on_progress: Progress | None = None) -> Recovered:
@@ -85,6 +90,9 @@ def recover(recording: Recording, path: Path, *, on_progress: Progress | None = 
         skipped=dict(copy.skipped),
         losses=recording.losses,
         damage=tuple(str(damage) for damage in recording.damage),
+        attachments=copy.attachments,
+        metadata=copy.metadata,
+        lost=tuple(copy.lost),
     )
 
 
@@ -99,9 +107,11 @@ class _Copy:
         self._known: dict[tuple[str, str, int], int] = {}
         self.good = GoodMessages()
         self.skipped: Counter[tuple[str, str]] = Counter()
+        self.attachments = self.metadata = 0
+        self.lost: list[LostExtra] = []
 
     def fill(self, on_progress: Progress | None) -> None:
-        """Write all messages that can be read; also after an interrupt the file is whole."""
+        """Write all that can be read; also after an interrupt the file is whole."""
         encodings = {channel.encoding for channel in self._recording.channels}
         self._writer.start(profile=PROFILES.get(encodings.pop(), "") if len(encodings) == 1 else "", library=LIBRARY)
         expected = sum(channel.count for channel in self._recording.channels)
@@ -109,6 +119,8 @@ class _Copy:
             for channel in self._recording.channels:
                 self._number(channel)
                 self.good.setdefault(channel.topic, Good())
+            with uninterrupted():
+                self._put_extras(self._recording.extras())
             for done, message in enumerate(self._recording.messages(), start=1):
                 with uninterrupted():
                     self._put(message)
@@ -117,6 +129,21 @@ class _Copy:
         finally:
             with uninterrupted():
                 self._writer.finish()
+
+    def _put_extras(self, extras: Extras) -> None:
+        """Write what lies beside the messages."""
+        self.lost += extras.lost
+        for attachment in extras.attachments:
+            name, media_type, log_ns, create_ns, data = attachment
+            if len(data) > LARGEST_ATTACHMENT_BYTES:
+                reason = f"its {len(data)} bytes are more than the {LARGEST_ATTACHMENT_BYTES} that are copied"
+                self.lost.append(LostExtra(ExtraKind.ATTACHMENT, name, reason))
+                continue
+            self._writer.add_attachment(create_ns, log_ns, name, media_type, bytes(data))
+            self.attachments += 1
+        for metadata in extras.metadata:
+            self._writer.add_metadata(metadata.name, metadata.values)
+            self.metadata += 1
 
     def _put(self, message: Message) -> None:
         channel = message.channel

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
-from pipelines.geometry import heading_of_quat
+from pipelines.planar import heading_of_quat
 from pipelines.ranging.step import RangeStep
 from pipelines.semidirect.baseline_step import BaselineStep
 from pipelines.semidirect.step import SemidirectStep
@@ -183,7 +183,7 @@ class SensorWriter(_Writer):
         """Log that a frame has no image, and why; the viewer then shows none."""
         self._write()
         at = np.array([frame]), np.array([t_ns])
-        self._file.send("/camera/problems", *at, rr.TextLog.columns(text=[reason], level=["ERROR"]))
+        self._file.send("/camera/problems", *at, texts([traces.Event(frame, Severity.ERROR, reason)]))
         self._file.send(IMAGE, *at, rr.Clear.columns(is_recursive=[False]))
 
     def reference(self, poses: Sequence[PoseSample]) -> None:

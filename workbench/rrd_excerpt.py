@@ -7,6 +7,7 @@ a recording of their own. A file without an index gets one in a copy first.
 
 from __future__ import annotations
 
+import functools
 import struct
 import tempfile
 import warnings
@@ -104,6 +105,13 @@ class RrdParts:
 
 
 def _places(path: Path) -> list[Place]:
+    about = path.stat()
+    return _places_of(path, about.st_size, about.st_mtime_ns)
+
+
+@functools.lru_cache(maxsize=4)  # one command asks for several parts of the same two files
+def _places_of(path: Path, size: int, time_ns: int) -> list[Place]:
+    """The index of a file as it is at that size and time."""
     batch = RrdReader(path).store()._chunk_index().to_arrow()
 
     def column(name: str) -> list[Any]:

@@ -16,6 +16,7 @@ from pipelines.verdict import Severity
 from readers.streams import RecordingError, WorkbenchError
 from workbench import traces
 from workbench.blueprints import Extent
+from workbench.safe_text import printable
 
 APPLICATION = "estimator_workbench"
 IMAGE = "/camera/image"
@@ -143,7 +144,7 @@ def numbers(column: pa.Array) -> NDArray[Any]:
 
 def texts(events: Sequence[traces.Event]) -> rr.ComponentColumnList:
     """Lines of a log."""
-    return rr.TextLog.columns(text=[e.text for e in events], level=[LEVELS[e.severity] for e in events])
+    return rr.TextLog.columns(text=[printable(e.text) for e in events], level=[LEVELS[e.severity] for e in events])
 
 
 def flat(points: Floats, layer: str = "") -> NDArray[np.float32]:
@@ -154,8 +155,8 @@ def flat(points: Floats, layer: str = "") -> NDArray[np.float32]:
 
 
 def document(text: str) -> rr.TextDocument:
-    """A text in Markdown."""
-    return rr.TextDocument(text, media_type="text/markdown")
+    """A text in Markdown; what looks like HTML in it is text."""
+    return rr.TextDocument(printable(text).replace("<", "&lt;"), media_type="text/markdown")
 
 
 def marker(name: str, radius: float) -> rr.Points3D:

@@ -38,7 +38,7 @@ class Series(NamedTuple):
 
 
 def chunks(
-    path: Path, content: str, *, is_static: bool | None = False, components: Sequence[str] | None = None
+    path: Path, content: str | Sequence[str], *, is_static: bool | None = False, components: Sequence[str] | None = None
 ) -> Iterator[Any]:
     """The chunks of some entities, also of a file without a footer or with a torn end.
 
@@ -116,8 +116,10 @@ def _joined(parts: Iterable[Any], component: str) -> Series:
 
 def _rows(column: pa.ListArray) -> NDArray[Any]:
     """The rows of an Arrow column of lists: [n, k] of numbers where all are equally long, else [n] of arrays."""
-    lengths = numbers(column.value_lengths())
-    flat = column.flatten()
+    offsets = numbers(column.offsets)
+    lengths = np.diff(offsets)
+    # flatten() loads Arrow's functions, which takes longer than most commands; only rows that are null need it
+    flat = column.flatten() if column.null_count else column.values[int(offsets[0]) : int(offsets[-1])]
     if not (pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)):
         return objects(column.to_pylist())
     values = numbers(flat)
@@ -162,7 +164,7 @@ def columns(
     needed = schema.sharing({*wanted, "verdict"})
     components = sorted({row.component for row in needed if row.component})
     groups: dict[tuple[str, str], list[Any]] = {(row.entity, row.component): [] for row in needed if row.component}
-    for chunk in chunks(path, f"{root}/**", components=components):
+    for chunk in chunks(path, sorted({f"{root}/{entity}" for entity, _ in groups}), components=components):
         for name in components:
             key = (chunk.entity_path.removeprefix(f"{root}/"), name)
             if key in groups:

@@ -4,7 +4,8 @@ Each stream has the entity ``/sensors/streams/STREAM``. What every sample has st
 its class, its place `order` in the order in which all streams came, `received_ns`, the number of a frame. Numbers that
 make a plot are `Scalars`; tracks and landmarks keep theirs in ``Sample:values``. An image's pixels stand at
 ``/camera/image``; only where that picture does not give back the very grey levels that the estimator got, these stand
-at ``/sensors/grey/STREAM`` once more, as PNG.
+at ``/sensors/grey/STREAM`` once more, as PNG. Of messages that have a stamp, ``/sensors/clocks/STREAM`` plots by how
+much log time exceeds it, in ms.
 """
 
 from __future__ import annotations
@@ -39,6 +40,7 @@ from workbench.rrd_file import numbers as plain
 
 ROOT = "/sensors/streams"
 GREY = "/sensors/grey"
+CLOCKS = "/sensors/clocks"
 ARCHETYPE = "Sample"
 _SCALARS = "Scalars:scalars"
 
@@ -91,7 +93,7 @@ FORMS = {
 
 
 def entity_of(stream: str, root: str = ROOT) -> str:
-    """Where the samples of a stream stand; under `GREY` their grey levels."""
+    """Where the samples of a stream stand; under `GREY` their grey levels, under `CLOCKS` the lag of log time."""
     return "/".join([root, *(rr.escape_entity_path_part(part) for part in stream.split("/") if part)])
 
 
@@ -145,7 +147,6 @@ class SampleLog:
 
     def _send(self, entity: str, form: Form, rows: Sequence[Stored]) -> None:
         samples = [row.sample for row in rows]
-        numbers = [_numbers(form, sample) for sample in samples]
         components: dict[str, Any] = {
             "order": [row.order for row in rows],
             "received_ns": [sample.received_ns for sample in samples],
@@ -159,9 +160,10 @@ class SampleLog:
         columns: list[Any] = []
         if form.numbers and form.plotted:
             self._legend(entity, form)
-            columns += rr.Scalars.columns(scalars=np.concatenate(numbers)).partition([len(n) for n in numbers])
+            table = _table(form, samples)
+            columns += rr.Scalars.columns(scalars=table.ravel()).partition([table.shape[1]] * len(table))
         elif form.numbers:
-            lists["values"] = numbers
+            lists["values"] = [_numbers(form, sample) for sample in samples]
         columns += rr.DynamicArchetype.columns(ARCHETYPE, components=components)
         for name, values in lists.items():
             flat: Any = list(itertools.chain(*values)) if name == "texts" else np.concatenate(values)
@@ -171,9 +173,21 @@ class SampleLog:
             columns += column.partition([len(v) for v in values])
         # not on the timeline of frames: its numbers are those of the frames of one stream
         t_ns = np.array([sample.t_ns for sample in samples], np.int64)
-        frames = [getattr(sample, "frame", -1) for sample in samples]
-        on_frames = all(frame >= 0 for frame in frames)
-        self._file.send(entity, np.array(frames, np.int64) if on_frames else None, t_ns, columns)
+        frames = np.array([getattr(sample, "frame", -1) for sample in samples], np.int64)
+        on_frames = bool((frames >= 0).all())
+        self._file.send(entity, frames if on_frames else None, t_ns, columns)
+        self._lags(samples, frames if on_frames else None, t_ns)
+
+    def _lags(self, samples: Sequence[Sample], frames: NDArray[np.int64] | None, t_ns: NDArray[np.int64]) -> None:
+        """Log time less header stamp of the samples that have both, ms."""
+        stamped = [sample.header_ns > 0 for sample in samples]
+        lags_ms = [(sample.received_ns - sample.header_ns) / 1e6 for sample in itertools.compress(samples, stamped)]
+        entity = entity_of(samples[0].stream, CLOCKS)
+        if lags_ms and entity not in self._named:
+            self._named.add(entity)
+            self._file.static(entity, rr.SeriesLines(names=[f"{samples[0].stream}: log time - stamp, ms"]))
+        columns = rr.Scalars.columns(scalars=lags_ms)
+        self._file.send(entity, None if frames is None else frames[stamped], t_ns[stamped], columns)
 
     def _legend(self, entity: str, form: Form) -> None:
         if entity not in self._named:
@@ -183,7 +197,13 @@ class SampleLog:
 
 def _numbers(form: Form, sample: Sample) -> NDArray[np.float64]:
     parts = [np.asarray(getattr(sample, name), np.float64).ravel() for name, _ in form.numbers]
-    return np.concatenate(parts) if parts else np.empty(0)
+    return np.concatenate(parts)
+
+
+def _table(form: Form, samples: Sequence[Sample]) -> NDArray[np.float64]:
+    """The numbers of samples that all have as many of them [n, k]."""
+    parts = [np.array([getattr(sample, name) for sample in samples], np.float64) for name, _ in form.numbers]
+    return np.concatenate([part.reshape(len(samples), -1) for part in parts], axis=1)
 
 
 def _names(form: Form) -> Iterable[str]:

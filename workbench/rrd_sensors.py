@@ -3,9 +3,10 @@
 from __future__ import annotations
 
 import dataclasses
+import tomllib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
-from typing import Any, Self
+from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 import pyarrow as pa
@@ -16,6 +17,9 @@ from readers.streams import ImageSample, RecordingError, Sample
 from workbench.rrd_excerpt import Place, RrdParts
 from workbench.rrd_file import IMAGE, numbers
 from workbench.rrd_samples import ARCHETYPE, GREY, Stored, entity_of, order_of, samples_of
+
+if TYPE_CHECKING:
+    from workbench.runs import Run
 
 Ints = NDArray[np.int64]
 _SCALARS = "Scalars:scalars"
@@ -30,6 +34,7 @@ class SensorReader:
         frame_stream: the stream of the frames.
 
     Attributes:
+        path: the file.
         frames: numbers of the frames, rising [n].
         order: their places in the order of arrival [n].
         t_ns: their sensor times [n].
@@ -39,7 +44,7 @@ class SensorReader:
     """
 
     def __init__(self, path: Path, frame_stream: str) -> None:
-        self._path, self._stream = path, frame_stream
+        self.path, self._stream = path, frame_stream
         self._parts = RrdParts(path)
         self._images = self._parts.of([entity_of(frame_stream, GREY)]) + self._parts.of([IMAGE])
         self._held: dict[Place, dict[int, ImageSample]] = {}
@@ -64,23 +69,34 @@ class SensorReader:
         """
         at = int(np.searchsorted(self.frames, frame))
         if at == len(self.frames) or self.frames[at] != frame:
-            raise RecordingError(self._path, f"holds no frame {frame}", _CURE)
+            raise RecordingError(self.path, f"holds no frame {frame}", _CURE)
         return int(self.order[at])
 
     def samples(self, streams: Sequence[str], after: int, upto: int) -> Iterator[Sample]:
-        """The samples of some streams in the order of arrival, from behind one place up to another included.
+        """The samples of the frames' stream and of some others, from behind one place in order up to another included.
 
         Images come decoded, as `pipelines.replay` gives them to an estimator.
 
         Raises:
             RecordingError: the image of a frame is not in the file.
         """
-        chosen: list[Stored] = []
-        for stream in dict.fromkeys([self._stream, *streams]):
-            chosen += samples_of(stream, self._of(stream), after, upto)
+        chosen = [
+            stored for stream in dict.fromkeys([self._stream, *streams]) for stored in self.bare(stream, after, upto)
+        ]
         for stored in sorted(chosen, key=lambda one: one.order):
-            sample = stored.sample
-            yield grey_sample(self._whole(sample)) if isinstance(sample, ImageSample) else sample
+            yield self.decoded(stored.sample)
+
+    def bare(self, stream: str, after: int = -1, upto: int | None = None) -> list[Stored]:
+        """The samples of one stream in the order of arrival, likewise; images without their pixels, see `decoded`."""
+        return samples_of(stream, self._of(stream), after, np.iinfo(np.int64).max if upto is None else upto)
+
+    def decoded(self, sample: Sample) -> Sample:
+        """A bare sample as an estimator got it: an image with its grey levels, everything else as it is.
+
+        Raises:
+            RecordingError: the image is not in the file.
+        """
+        return grey_sample(self._whole(sample)) if isinstance(sample, ImageSample) else sample
 
     def grey(self, frame: int) -> NDArray[Any]:
         """Grey levels [height, width] of the image of a frame, as an estimator got them.
@@ -100,7 +116,7 @@ class SensorReader:
         batches = self._of(self._stream)
         if not batches:
             problem = f"holds no samples of {self._stream}: an older version wrote it"
-            raise RecordingError(self._path, problem, _CURE)
+            raise RecordingError(self.path, problem, _CURE)
         frames = np.concatenate([numbers(batch.column("frame")) for batch in batches])
         order = np.concatenate([order_of(batch) for batch in batches])
         t_ns = np.concatenate([numbers(batch.column("sensor_time")) for batch in batches])
@@ -127,7 +143,7 @@ class SensorReader:
         raise self._missing(sample.frame)
 
     def _missing(self, frame: int) -> RecordingError:
-        return RecordingError(self._path, f"holds no image of frame {frame}", _CURE)
+        return RecordingError(self.path, f"holds no image of frame {frame}", _CURE)
 
     def _load(self, place: Place) -> dict[int, ImageSample]:
         """The images of a chunk by their frames; those of the last two chunks are held."""
@@ -139,6 +155,34 @@ class SensorReader:
                 found |= dict(_images(batch))
             self._held[place] = found
         return self._held[place]
+
+
+def sensors_of(run: Run) -> SensorReader:
+    """The samples that a run's estimator got.
+
+    Raises:
+        RecordingError: the file is missing, or of another recording, window or choice of streams than the run.
+    """
+    file, again = run.sensors_file, f"{_CURE} into this folder"
+    try:
+        values = tomllib.loads(file.with_suffix(".toml").read_text("utf-8"))
+    except (OSError, ValueError):
+        values = None
+    if values is None or not file.is_file():
+        raise RecordingError(file, "is missing or was not finished", again)
+    if values.get("digest") != run.digest:
+        cure = f"{_CURE} into a folder of its own"
+        raise RecordingError(file, f"is of another recording than {run.name}", cure)
+    if "other_streams" not in run.about or "streams" not in values:
+        raise RecordingError(run.path("toml"), "is of an older version, which kept no samples", _CURE)
+    now = (run.about["image_stream"], run.toml.get("window"), run.about.get("order"))
+    if (values.get("frame_stream"), values.get("window"), values.get("order")) != now:
+        problem = f"was written again for another window, stream of frames or order of samples than {run.name} has"
+        raise RecordingError(file, problem, f"{_CURE}, best into a folder of its own (-o)")
+    missing = sorted({*run.about["other_streams"]} - {*values["streams"]})
+    if missing:
+        raise RecordingError(file, f"holds no samples of {', '.join(missing)}", again)
+    return SensorReader(file, run.about["image_stream"])
 
 
 def read_reference(path: Path) -> tuple[Ints, NDArray[np.float64]] | None:

@@ -501,6 +501,8 @@ This page is made by `python -m workbench.schema`; a test demands that it is cur
 | `/camera/problems` | frames without an image, and why |
 | `/world/reference/path`, `/pose`, `/heading` | the reference from above: whole path, and its pose at each frame |
 | `/sensors/reference` | the reference as numbers: x, y, z (m), heading (rad); on `sensor_time` |
+| `/sensors/streams/STREAM` | the samples that the estimator got, by stream; on `sensor_time`, of frames on both |
+| `/sensors/clocks/STREAM` | log time less header stamp (ms), of messages that have both: latency and jitter |
 | `/world/scale` | a scale bar |
 | `/recording/facts` | facts of the recording |
 

@@ -247,7 +247,7 @@ def run(
         raise SettingsError(f"--stride {request.stride}: must be 1 or more")
     with recording or open_any(request.path, request.options) as opened:
         session = _prepare(request, opened, estimator, resolved, name, preset)
-        if on_warnings is not None and (warnings := session.clock_warnings()):
+        if on_warnings is not None and (warnings := [*opened.cache_troubles, *session.clock_warnings()]):
             on_warnings(warnings)
         with Interrupt() as interrupt:
             return session.replay(writers or rerun_writers(), interrupt, on_progress)

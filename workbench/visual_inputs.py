@@ -23,7 +23,7 @@ from workbench.inputs import (
     height_of,
     intrinsics,
     of_kind,
-    source_of,
+    other_size,
 )
 from workbench.settings import Resolved
 
@@ -60,12 +60,9 @@ def with_camera(
             f"{recording.path}: {found} of the camera of {image}, and visual odometry needs one: give --camera FILE, "
             "or --set focal_px=… (and centre_px)"
         )
-    made_for = (camera.width_px, camera.height_px)
-    if made_for not in (size_px, (0, 0)):
+    if other := other_size(camera, size_px):
         raise StreamError(
-            f"{recording.path}: {source_of(camera)} is for {made_for[0]} x {made_for[1]} px, but the images of {image} "
-            f"are {size_px[0]} x {size_px[1]} px: give --camera for these images, or --scale-camera if they were "
-            "resized"
+            f"{recording.path}: {image}: {other}: give --camera for these images, or --scale-camera if they were resized"
         )
     return _with_mounting(filled(resolved, intrinsics(camera)), camera, [camera_sentence(camera)])
 

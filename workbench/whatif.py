@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import math
 import re
-import tomllib
 from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import BaseModel
 
 from pipelines.estimator import Estimator, EstimatorError, Resumable, Step
-from pipelines.geometry import wrap_angle
+from pipelines.planar import wrap_angle
 from pipelines.replay import stepped
 from pipelines.verdict import Verdict, flags
 from readers.streams import RecordingError, Sample, StreamError
@@ -135,7 +134,7 @@ def ask(question: Question) -> Answer:
     Raises:
         WorkbenchError: it cannot be done; the text says what is missing, where, and the cure.
     """
-    from workbench.rrd_sensors import SensorReader
+    from workbench.rrd_sensors import sensors_of
 
     run = open_run(question.run)
     chosen = plugin(run.about["estimator"])
@@ -144,8 +143,8 @@ def ask(question: Question) -> Answer:
     old, new = chosen.build(old_settings), chosen.build(new_settings)
     name = _name(run, question)
     _check_fields(question, new.step_type)
-    _check_sensors(run, new_settings)
-    with SensorReader(run.folder / "sensors.rrd", run.about["image_stream"]) as sensors:
+    with sensors_of(run) as sensors:
+        _check_height(run, new_settings)
         window = Window.of(question, sensors.frames, sensors.t_ns)
         steps, verified = _replayed(run, sensors, window, old, new)
         reference = _reference(run, window)
@@ -229,31 +228,12 @@ def _check_fields(question: Question, step_type: type[Step]) -> None:
             raise StreamError(f"--fields {name}: the steps have no such number; they have {', '.join(known)}")
 
 
-def _check_sensors(run: Run, settings: BaseModel) -> None:
-    """See that sensors.rrd holds what this run got.
+def _check_height(run: Run, settings: BaseModel) -> None:
+    """See that the run read the stream of heights that its new settings name.
 
     Raises:
-        RecordingError: it is missing, or of another recording, window or choice of streams.
-        StreamError: a changed setting names a stream that is not in it.
+        StreamError: it did not.
     """
-    file = run.folder / "sensors.rrd"
-    try:
-        values = tomllib.loads(file.with_suffix(".toml").read_text("utf-8"))
-    except (OSError, ValueError):
-        values = None
-    if values is None or not file.is_file():
-        raise RecordingError(file, "is missing or was not finished", f"{AGAIN} into this folder")
-    if values.get("digest") != run.about["digest"]:
-        raise RecordingError(file, f"is of another recording than {run.name}", f"{AGAIN} into a folder of its own")
-    if "other_streams" not in run.about or "streams" not in values:
-        raise RecordingError(run.path("toml"), "is of an older version, which kept no samples", AGAIN)
-    now = (run.about["image_stream"], run.toml.get("window"), run.about.get("order"))
-    if (values.get("frame_stream"), values.get("window"), values.get("order")) != now:
-        problem = f"was written again for another window, stream of frames or order of samples than {run.name} has"
-        raise RecordingError(file, problem, f"{AGAIN}, best into a folder of its own (-o)")
-    missing = sorted({*run.about["other_streams"]} - {*values["streams"]})
-    if missing:
-        raise RecordingError(file, f"holds no samples of {', '.join(missing)}", f"{AGAIN} into this folder")
     height = getattr(settings, "height_stream", "")
     if height and height not in run.about["other_streams"]:
         raise StreamError(f"height_stream = {height!r}: the run {run.name} did not read it; {AGAIN} with it")

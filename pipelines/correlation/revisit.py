@@ -13,7 +13,7 @@ from pipelines.correlation.equations import Motion
 from pipelines.correlation.matching import NO_COVARIANCE, Candidate, Matcher, Template
 from pipelines.correlation.odometry import convincing, eight_bit
 from pipelines.correlation.settings import CorrelationSettings
-from pipelines.geometry import wrap_angle
+from pipelines.planar import wrap_angle
 
 Floats = NDArray[np.float64]
 Grey = NDArray[np.uint8]

@@ -11,7 +11,7 @@ from typing import NamedTuple
 from pipelines.correlation import equations as eq
 from pipelines.correlation.equations import Motion
 from pipelines.correlation.settings import Correction, CorrelationSettings
-from pipelines.geometry import wrap_angle
+from pipelines.planar import wrap_angle
 
 Pose = tuple[float, float, float]
 

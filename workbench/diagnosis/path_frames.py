@@ -46,46 +46,54 @@ def _tell_count(what: str) -> Callable[[Shown], Told]:
     return tell
 
 
-DUPLICATE = Mode(
-    name="duplicate-frames",
-    severity=Severity.WARNING,
+def _told_by_alarm(
+    name: str, severity: Severity, what: str, cause: str, remedy: str, shows: Callable[[Signals, Bounds, Bools], Bools]
+) -> Mode:
+    """A failure that an alarm of the odometry names; `what` says of the frames what they are."""
+    return Mode(
+        name=name,
+        severity=severity,
+        cause=cause,
+        remedy=remedy,
+        thresholds={},
+        shows=shows,
+        strength=_ones,
+        tell=_tell_count(what),
+    )
+
+
+DUPLICATE = _told_by_alarm(
+    "duplicate-frames",
+    Severity.WARNING,
+    what="repeat the one before, pixel by pixel",
     cause="the driver or the recorder sends an image again when no new one has come",
     remedy="look at the camera's driver and at its rate; the repeats themselves are passed over and do no harm, "
     "the gap behind them does: raise search_radius_px, or key_max_shift_px",
-    thresholds={},
     shows=_with_next(Verdict.DUPLICATE_FRAME),
-    strength=_ones,
-    tell=_tell_count("repeat the one before, pixel by pixel"),
 )
-UNDECODABLE = Mode(
-    name="undecodable-frames",
-    severity=Severity.WARNING,
+UNDECODABLE = _told_by_alarm(
+    "undecodable-frames",
+    Severity.WARNING,
+    what="could not be decoded",
     cause="damaged or cut off images in the recording",
     remedy="look at `workbench inspect`: a full disk, a lossy link or an unknown encoding; the frames are passed over",
-    thresholds={},
     shows=_with_next(Verdict.UNDECODABLE),
-    strength=_ones,
-    tell=_tell_count("could not be decoded"),
 )
-SIZE = Mode(
-    name="size-change",
-    severity=Severity.ERROR,
+SIZE = _told_by_alarm(
+    "size-change",
+    Severity.ERROR,
+    what="have another size than the one before, and the odometry started again",
     cause="the camera's mode was changed, or two cameras write into one stream",
-    remedy="replay the parts by themselves with --start and --stop; settings in px are those of one size",
-    thresholds={},
+    remedy="replay the parts by themselves with --from and --to; settings in px are those of one size",
     shows=_ringing(Verdict.SIZE_CHANGED),
-    strength=_ones,
-    tell=_tell_count("have another size than the one before, and the odometry started again"),
 )
-OUT_OF_ORDER = Mode(
-    name="out-of-order",
-    severity=Severity.ERROR,
+OUT_OF_ORDER = _told_by_alarm(
+    "out-of-order",
+    Severity.ERROR,
+    what="carry a stamp that is not after the one before, and were left out",
     cause="stamps that stand still or go back: a clock that was set, or a driver that stamps twice",
     remedy="look at `workbench inspect`; stamp the images in the camera's driver by a monotonic clock",
-    thresholds={},
     shows=_with_next(Verdict.OUT_OF_ORDER),
-    strength=_ones,
-    tell=_tell_count("carry a stamp that is not after the one before, and were left out"),
 )
 
 

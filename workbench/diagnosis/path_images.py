@@ -137,6 +137,13 @@ def _held(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     return np.asarray((speed < bounds["still_share"] * usual_speed) & (usual_speed > bounds["min_speed_px"]))
 
 
+def _residual_evidence(shown: Shown) -> Evidence:
+    """What remains after the match, and how much is too much."""
+    residual = shown.signals.residual
+    bound = shown.bounds["residual_factor"] * usual(residual)[shown.worst]
+    return evidence(shown.signals, "residual_rms", residual, shown.worst, "grey", bound)
+
+
 def _noisy(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
     """White noise of σ leaves residuals of σ to √2 σ and adds four times σ² to the squared gradient."""
     residual = signals.residual
@@ -155,14 +162,7 @@ def _tell_noise(shown: Shown) -> Told:
         f"In {shown.frames} up to {residual[worst]:.1f} grey levels remain after the match "
         f"(usual: {usual(residual)[worst]:.1f}), and the image is rough as by noise of that size.",
         (
-            evidence(
-                signals,
-                "residual_rms",
-                residual,
-                worst,
-                "grey",
-                shown.bounds["residual_factor"] * usual(residual)[worst],
-            ),
+            _residual_evidence(shown),
             evidence(signals, "gradient_energy", signals.gradient_energy, worst, "grey²/px²"),
             evidence(signals, "peak_correlation", signals.correlation, worst),
         ),
@@ -206,20 +206,13 @@ def _dirty(signals: Signals, bounds: Bounds, before: Bools) -> Bools:
 
 def _tell_dirt(shown: Shown) -> Told:
     signals, worst = shown.signals, shown.worst
-    residual, speed = signals.residual, np.hypot(*signals.shift.T)
+    speed = np.hypot(*signals.shift.T)
     return (
         f"In {shown.frames} {signals.residual[worst]:.1f} grey levels remain after the match (usual: "
         f"{usual(signals.residual)[worst]:.1f}), new templates or not, and the shift is {speed[worst]:.2f} px where "
         f"{usual(speed)[worst]:.1f} px are usual: a pattern does not move with the ground.",
         (
-            evidence(
-                signals,
-                "residual_rms",
-                residual,
-                worst,
-                "grey",
-                shown.bounds["residual_factor"] * usual(residual)[worst],
-            ),
+            _residual_evidence(shown),
             evidence(signals, "frame_shift_px", speed, worst, "px"),
             evidence(signals, "gain", signals.gain, worst),
         ),

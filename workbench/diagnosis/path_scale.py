@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from pipelines.geometry import wrap_angles
+from pipelines.planar import wrap_angles
 from pipelines.verdict import Severity
 from workbench.diagnosis.finding import Bools, Evidence, Floats
 from workbench.diagnosis.path_mode import Bounds, Mode, Shown, Told, evidence

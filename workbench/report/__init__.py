@@ -9,13 +9,13 @@ from __future__ import annotations
 import os
 from pathlib import Path
 
-from workbench.report.facts import Drift, Facts, facts_of, values
+from workbench.report.facts import Facts, facts_of, values
 from workbench.report.markup import drawing
 from workbench.report.page import PICTURED, html
 from workbench.report.pictures import Picture, pictures
 from workbench.report.text import markdown
 
-__all__ = ["Drift", "Facts", "facts_of", "page_of", "pictures_of", "text_of", "values", "write"]
+__all__ = ["Facts", "facts_of", "page_of", "pictures_of", "text_of", "values", "write"]
 
 
 def pictures_of(facts: Facts) -> dict[int, Picture]:

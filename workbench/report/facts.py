@@ -20,7 +20,7 @@ from pipelines.verdict import Severity, Verdict, flags
 from readers.streams import WorkbenchError
 from workbench.diagnosis import diagnose
 from workbench.diagnosis.finding import Case, Finding
-from workbench.judgement import budget_of
+from workbench.judgement import REFERENCE, WHOLES, Drift, drift_of
 from workbench.report import curves
 from workbench.runs import Run
 from workbench.summary import NOTABLE_DRIFT
@@ -57,48 +57,6 @@ class Counted:
     frames: int
     severity: Severity
     sentence: str
-
-
-@dataclass(frozen=True, slots=True, kw_only=True)
-class Drift:
-    """The drift budget by frame: what each adds to the end-point error [n], in m, of wrong shifts and of wrong turns.
-
-    NaN for a frame that has no share; `end_error_m` is what all sum to, `about` how to read it.
-    """
-
-    shift_m: Floats
-    heading_m: Floats
-    end_error_m: float
-    about: str = ""
-
-    @classmethod
-    def of_rows(
-        cls,
-        count: int,
-        rows: NDArray[np.int64],
-        shift_m: Floats,
-        heading_m: Floats,
-        end_error_m: float,
-        about: str = "",
-    ) -> Drift:
-        """The budget of a run of `count` frames, given for some of its rows [m] only.
-
-        Args:
-            count: frames of the run.
-            rows: which of them have a share, ascending.
-            shift_m: their shares of wrong shifts along the end-point error.
-            heading_m: those of wrong turns.
-            end_error_m: length of the end-point error.
-            about: how to read it.
-        """
-        shift, heading = np.full((2, count), np.nan)
-        shift[rows], heading[rows] = shift_m, heading_m
-        return cls(shift_m=shift, heading_m=heading, end_error_m=end_error_m, about=about)
-
-    @property
-    def harm_m(self) -> Floats:
-        """Shift and heading together [n]."""
-        return self.shift_m + self.heading_m
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -177,7 +135,7 @@ def facts_of(
     """
     run.columns(run.fields)  # at once: a file with a torn end is mended anew for each reading
     missing = _missing(run)
-    drift = _attempt(lambda: _drift_of(run), None, "the drift budget", missing) if drift is None else drift
+    drift = _attempt(lambda: drift_of(run), None, "the drift budget", missing) if drift is None else drift
     harm = None if drift is None else drift.harm_m
     found = diagnose(_case(run, harm, missing)) if findings is None else findings
     no_charts: list[curves.Chart] = []
@@ -209,23 +167,6 @@ def facts_of(
         charts=charts,
         strip=curves.strip(run),
         run=run,
-    )
-
-
-def _drift_of(run: Run) -> Drift | None:
-    """The drift budget of a run; None where there is none."""
-    budget = budget_of(run)
-    if budget is None or run.trajectory is None:
-        return None
-    rows = np.searchsorted(run.t_ns, run.trajectory.t_ns[budget.index])
-    derived = "the reference has no headings: they are derived from its path, and turns are told less sharply"
-    return Drift.of_rows(
-        len(run.frames),
-        rows,
-        budget.shift_harm_m,
-        budget.heading_harm_m,
-        float(np.hypot(*budget.end_error_m)),
-        derived if budget.headings == "derived" else "",
     )
 
 
@@ -438,9 +379,19 @@ def spans_text(finding: Finding, most: int = 8) -> str:
     return ", ".join(words[:most]) + more
 
 
-def harm_text(finding: Finding) -> str:
+def harm_text(facts: Facts, finding: Finding) -> str:
     """What a finding did, in metres; nothing where that is not known."""
-    return "" if math.isnan(finding.harm_m) else f"{length(finding.harm_m)} of the end-point error"
+    if math.isnan(finding.harm_m):
+        return ""
+    return f"{length(finding.harm_m)} of {WHOLES[REFERENCE] if facts.drift is None else facts.drift.whole}"
+
+
+def drift_text(drift: Drift) -> str:
+    """A drift budget in a sentence or two."""
+    shift, heading = (length(float(np.nansum(part))) for part in (drift.shift_m, drift.heading_m))
+    apart = length(drift.end_error_m)
+    end = f"The end is {apart} off" if drift.source == REFERENCE else f"Forward and backward replay end {apart} apart"
+    return f"{end}: {shift} by wrong shifts, {heading} by wrong turns carried to the end. {drift.about}".rstrip()
 
 
 def commands(facts: Facts, finding: Finding) -> list[str]:
@@ -504,13 +455,14 @@ def values(facts: Facts) -> dict[str, Any]:
         **{name: _plain(value) for name, value in kept.items()},
         "gravity": facts.gravity.name,
         "findings": [_plain(finding) | {"frames": finding.frames} for finding in facts.findings],
-        "drift": None if facts.drift is None else {"end_error_m": facts.drift.end_error_m, "by_frame": [
-            {"frame": int(f), "shift_m": s, "heading_m": h}
-            for f, s, h in zip(facts.run.frames.tolist(), facts.drift.shift_m.tolist(), facts.drift.heading_m.tolist(),
-                               strict=True)
-            if math.isfinite(s) and math.isfinite(h)
-        ]},
-    }  # fmt: skip
+        "drift": None if facts.drift is None else _drift_values(facts.run, facts.drift),
+    }
+
+
+def _drift_values(run: Run, drift: Drift) -> dict[str, Any]:
+    rows = zip(run.frames.tolist(), drift.shift_m.tolist(), drift.heading_m.tolist(), strict=True)
+    by_frame = [{"frame": f, "shift_m": s, "heading_m": h} for f, s, h in rows if math.isfinite(s) and math.isfinite(h)]
+    return {"source": drift.source, "end_error_m": drift.end_error_m, "by_frame": by_frame}
 
 
 def _plain(value: Any) -> Any:

@@ -6,6 +6,8 @@ import xml.etree.ElementTree as ET
 from collections.abc import Iterable
 from typing import TypeAlias
 
+from workbench.safe_text import printable
+
 Element: TypeAlias = ET.Element
 Content: TypeAlias = "str | Element | Iterable[Content] | None"
 
@@ -46,11 +48,6 @@ def _add_text(element: Element, text: str) -> None:
         element[-1].tail = (element[-1].tail or "") + text
     else:
         element.text = (element.text or "") + text
-
-
-def printable(text: str) -> str:
-    """A text without control characters, half surrogates and marks that turn the reading direction: their codes."""
-    return "".join(c if c.isprintable() or c == "\n" else c.encode("unicode_escape").decode() for c in text)
 
 
 def page(root: Element) -> str:

@@ -13,9 +13,10 @@ import numpy as np
 
 from pipelines.verdict import Severity
 from workbench.diagnosis.finding import Evidence, Finding
+from workbench.judgement import Drift
 from workbench.report import plots
 from workbench.report.curves import Chart, Curve, seconds
-from workbench.report.facts import Counted, Drift, Facts, Metric, commands, harm_text, length, spans_text
+from workbench.report.facts import Counted, Facts, Metric, commands, drift_text, harm_text, length, spans_text
 from workbench.report.markup import Content, Element, el, page
 from workbench.report.pictures import Picture
 
@@ -123,7 +124,7 @@ def _sections(facts: Facts, pictures: Mapping[int, Picture]) -> list[Element | N
 def _verdict(facts: Facts, errors: Sequence[Chart]) -> Element:
     """The verdict, what did the most harm, and the error with the findings' frames."""
     known = any(math.isfinite(f.harm_m) for f in facts.findings) or not facts.findings
-    first = [_card(k, f) for k, f in enumerate(facts.findings[:FIRST])]
+    first = [_card(facts, k, f) for k, f in enumerate(facts.findings[:FIRST])]
     found: Content = el("ol", first, class_="cards") if first else el("p", "The diagnosis found nothing.")
     return section(
         "verdict",
@@ -140,9 +141,10 @@ def _verdict(facts: Facts, errors: Sequence[Chart]) -> Element:
     )  # fmt: skip
 
 
-def _card(place: int, finding: Finding) -> Element:
+def _card(facts: Facts, place: int, finding: Finding) -> Element:
     word = WORDS[finding.severity]
-    harm: Content = (": ", el("strong", harm_text(finding))) if harm_text(finding) else None
+    did = harm_text(facts, finding)
+    harm: Content = (": ", el("strong", did)) if did else None
     return el(
         "li",
         el("p", el("strong", word, class_=f"badge {word}"), " ",
@@ -195,7 +197,7 @@ def _finding(facts: Facts, place: int, finding: Finding, picture: Picture | None
             [
                 (el("dt", name), el("dd", text))
                 for name, text in (
-                    ("Harm", harm_text(finding)),
+                    ("Harm", harm_text(facts, finding)),
                     ("Frames", f"{spans_text(finding)} ({finding.frames} in all); the worst is {finding.worst_frame}"),
                     ("Likely cause", finding.cause),
                     ("What to try", finding.remedy),
@@ -242,13 +244,9 @@ def _drift(facts: Facts) -> Element | None:
         return None
     shift, heading = (np.nancumsum(part) for part in (budget.shift_m, budget.heading_m))
     curves = (Curve("shift and heading", shift + heading), Curve("wrong shifts", shift), Curve("wrong turns", heading))
-    about = "What the frames up to here add to the end-point error."
+    about = f"What the frames up to here add to {budget.whole}."
     chart = Chart("drift", "Harm so far", "m", about, facts.run.frames, seconds(facts.run), curves)
-    told = (
-        f"The end is {length(budget.end_error_m)} off: {length(float(np.nansum(budget.shift_m)))} by wrong shifts, "
-        f"{length(float(np.nansum(budget.heading_m)))} by wrong turns carried to the end. {budget.about}"
-    )
-    return section("drift", "Drift budget", el("p", told), plots.chart_plot(chart, facts.findings),
+    return section("drift", "Drift budget", el("p", drift_text(budget)), plots.chart_plot(chart, facts.findings),
                     _worst(facts, budget))  # fmt: skip
 
 

@@ -2,13 +2,12 @@
 
 from __future__ import annotations
 
-import math
 import re
 from collections.abc import Iterable, Mapping, Sequence
 
-from workbench.report.facts import Facts, commands, harm_text, length, spans_text
-from workbench.report.markup import printable
+from workbench.report.facts import Facts, commands, drift_text, harm_text, spans_text
 from workbench.report.page import WORDS, metric_rows
+from workbench.safe_text import printable
 
 FINDINGS = 10
 """Findings that are told in full."""
@@ -31,10 +30,7 @@ def _blocks(facts: Facts, pictures: Mapping[int, Sequence[str]]) -> Iterable[str
         yield _titled("Metrics", _table(*metric_rows(facts.metrics)))
     yield _titled("Verdicts", ", ".join(f"{c.name} {c.frames}" for c in facts.verdicts))
     if facts.drift is not None:
-        shift, heading = (float(sum(v for v in part.tolist() if math.isfinite(v)))
-                          for part in (facts.drift.shift_m, facts.drift.heading_m))  # fmt: skip
-        yield (f"Drift budget: the end is {length(facts.drift.end_error_m)} off, {length(shift)} by wrong shifts, "
-               f"{length(heading)} by wrong turns.")  # fmt: skip
+        yield f"Drift budget: {plain(drift_text(facts.drift))}"
     yield "### Findings"
     yield from _findings(facts, pictures)
     versions = ", ".join(plain(f"{name} {version}") for name, version in facts.versions[:3])
@@ -45,7 +41,7 @@ def _findings(facts: Facts, pictures: Mapping[int, Sequence[str]]) -> Iterable[s
     if not facts.findings:
         yield "The diagnosis found nothing."
     for k, f in enumerate(facts.findings[:FINDINGS]):
-        grave = ", ".join(filter(None, (WORDS[f.severity], harm_text(f))))
+        grave = ", ".join(filter(None, (WORDS[f.severity], harm_text(facts, f))))
         cause, remedy = (plain(text).rstrip(".") for text in (f.cause, f.remedy))
         lines = [
             f"{k + 1}. **{plain(f.rule)}** ({grave}): {plain(f.sentence)}",

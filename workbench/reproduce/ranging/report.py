@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -198,26 +198,19 @@ def ways_table(found: Robot) -> Table:
 
 def tables(results: Results) -> dict[str, Table]:
     """The tables of what was computed, by name."""
-    made: dict[str, Table] = {"Table 1": table_1()}
-    if results.accuracy:
-        made["Table 2"] = table_2(results.accuracy)
-    if results.convergence:
-        made["Figs 6, 7: convergence"] = convergence_table(results.convergence)
-    if results.scaling:
-        made["scaling"] = scaling_table(results.scaling)
-    if results.consistency:
-        made["consistency"] = consistency_table(results.consistency)
-    if results.better:
-        made["what beats it"] = better_table(results.better)
-    if results.misprints:
-        made["misprints"] = misprints_table(results.misprints)
-    if results.asynchronous:
-        made["sensors of different rates"] = asynchronous_table(results.asynchronous)
-    if results.robot:
-        made["Table 3"] = table_3(results.robot)
-        made["Table 3 by odometer"] = implied_table(results.robot)
-        made["ways to feed the filter"] = ways_table(results.robot)
-    return made
+    parts: tuple[tuple[str, Callable[[Any], Table], Any], ...] = (
+        ("Table 2", table_2, results.accuracy),
+        ("Figs 6, 7: convergence", convergence_table, results.convergence),
+        ("scaling", scaling_table, results.scaling),
+        ("consistency", consistency_table, results.consistency),
+        ("what beats it", better_table, results.better),
+        ("misprints", misprints_table, results.misprints),
+        ("sensors of different rates", asynchronous_table, results.asynchronous),
+        ("Table 3", table_3, results.robot),
+        ("Table 3 by odometer", implied_table, results.robot),
+        ("ways to feed the filter", ways_table, results.robot),
+    )
+    return {"Table 1": table_1()} | {name: make(found) for name, make, found in parts if found is not None}
 
 
 # ---------------------------------------------------------------------------------- report
