@@ -18,9 +18,10 @@ import workbench.cli
 from pipelines.semidirect.step import SemidirectStep, Stage
 from pipelines.spatial import SpatialPath
 from pipelines.verdict import Verdict
-from readers.streams import StreamError
+from readers.streams import RecordingError, StreamError
 from workbench import rrd
 from workbench.compare import compare
+from workbench.consistency import consistency
 from workbench.diagnosis import diagnose
 from workbench.diagnosis.finding import Case
 from workbench.explain import explain
@@ -160,6 +161,8 @@ def test_without_height_the_scale_is_unknown_and_said_so(flights: Path, tmp_path
     assert done.summary["odometry"]["space"]["scale"] == pytest.approx(0.5, rel=0.05)
     assert not any(done.column("scale_known"))
     assert "scale-unknown" in {finding.rule for finding in diagnose(Case.of_run(done))}
+    with pytest.raises(RecordingError, match="of unknown scale"):
+        consistency(done)
 
 
 def test_positions_give_the_scale_only_when_asked_and_that_is_noted(flights: Path, tmp_path: Path) -> None:
@@ -251,6 +254,15 @@ def test_report_check_and_export(flights: Path, shell: Shell, tmp_path: Path) ->
     np.testing.assert_array_equal(
         read_tum(tmp_path / "one.tum").position_m, read_tum(file.with_suffix(".tum")).position_m
     )
+
+
+def test_a_run_is_held_against_itself_where_it_has_a_pose(flights: Path, tmp_path: Path) -> None:
+    shutil.copytree(flights / "runs", tmp_path / "runs")
+    done = open_run(tmp_path / "runs" / "one.rrd")
+    found = consistency(done)
+    assert found.unit == "m"
+    assert set(found.frame.tolist()) <= set(done.frames[done.column("accepted").astype(bool)].tolist())
+    assert "does not measure the motion between any two" in found.loops_why
 
 
 # -------------------------------------------------------------------------------------- findings

@@ -58,6 +58,15 @@ ADVICE: Mapping[Verdict, str] = {
     Verdict.INPUT_MISSING: "no odometry or no rate of turn at the start",
     Verdict.INPUT_OUT_OF_ORDER: "stamps of the odometry or the IMU go backwards",
     Verdict.INPUT_UNREADABLE: "messages of the odometry or the IMU are damaged",
+    Verdict.SCALE_DRIFT: "the map's scale drifts, or the ground is not as high as at the start: try the preset accurate",
+    Verdict.FEW_POINTS: "the map has too few points in view: fly slower, or lower keyframe_distance or "
+    "corner_threshold",
+    Verdict.POINTS_DROPPED: "points vanish at once: blur, something before the camera, or a leap between frames",
+    Verdict.ALIGNMENT_FAILED: "the camera moves further between two frames than the alignment follows: more frames a "
+    "second, or align_coarsest higher",
+    Verdict.RELOCALISED: "found again by a keyframe that looked alike; on a surface that repeats itself that can be "
+    "another place",
+    Verdict.NEW_MAP: "a new map was begun after a loss: mend the cause of the loss",
 }
 
 CIRCUMSTANCES = Verdict.DUPLICATE_FRAME | Verdict.FRAME_GAP | Verdict.HEIGHT_CHANGE | Verdict.EXPOSURE_JUMP

@@ -62,7 +62,7 @@ def with_camera(
         )
     if other := other_size(camera, size_px):
         raise StreamError(
-            f"{recording.path}: {image}: {other}: give --camera for these images, or --scale-camera if they were resized"
+            f"{recording.path}: {image}: {other}: give --camera for these, or --scale-camera if they were resized"
         )
     return _with_mounting(filled(resolved, intrinsics(camera)), camera, [camera_sentence(camera)])
 
