@@ -328,7 +328,9 @@ def visual_blueprint(step_type: type[Step], run: str, estimator: str, bounds: Bo
         rrb.Vertical(
             rrb.Horizontal(rrb.Tabs(*images), _visual_maps(run, bounds), column_shares=[5, 6]),
             rrb.Horizontal(
-                _visual_plots(root, bounds.frames, semidirect=semidirect), _texts(run, root), column_shares=[3, 2]
+                _visual_plots(root, bounds.frames, semidirect=semidirect),
+                _texts(run, root, _lags(bounds.frames)),
+                column_shares=[3, 2],
             ),
             rrb.StateTimelineView(origin=root, contents=lanes, name="Verdicts", time_view=_axis(bounds.frames)),
             row_shares=[10, 8, 5],

@@ -296,10 +296,10 @@ class Run:
         Raises:
             RecordingError: the run has no such frame, or its file cannot be read.
         """
-        from workbench.rrd import read_fields
-
         if not self.lists:
             return {}
+        from workbench.rrd import read_fields
+
         found = read_fields(self.file, self.name, self.step_type, self.lists, range(frame, frame + 1))
         return {name: values[0] for name, values in found.items()}
 

@@ -58,7 +58,7 @@ ADVICE: Mapping[Verdict, str] = {
     Verdict.INPUT_MISSING: "no odometry or no rate of turn at the start",
     Verdict.INPUT_OUT_OF_ORDER: "stamps of the odometry or the IMU go backwards",
     Verdict.INPUT_UNREADABLE: "messages of the odometry or the IMU are damaged",
-    Verdict.SCALE_DRIFT: "the map's scale drifts, or the ground is not as high as at the start: try the preset accurate",
+    Verdict.SCALE_DRIFT: "the scale drifts, or the ground is not as high as at the start: try the preset accurate",
     Verdict.FEW_POINTS: "the map has too few points in view: fly slower, or lower keyframe_distance or "
     "corner_threshold",
     Verdict.POINTS_DROPPED: "points vanish at once: blur, something before the camera, or a leap between frames",
