@@ -101,6 +101,26 @@ def hat(w: Floats) -> Floats:
 
 
 @compiled
+def quat_of_rotation(r: Floats) -> Floats:
+    """The unit quaternion x, y, z, w [4] of a rotation [3, 3], its largest component positive (Shepperd 1978)."""
+    trace = r[0, 0] + r[1, 1] + r[2, 2]
+    largest, k = trace, 3
+    for i in range(3):
+        if r[i, i] > largest:
+            largest, k = r[i, i], i
+    quat = np.empty(4)
+    if k == 3:
+        quat[0], quat[1], quat[2] = r[2, 1] - r[1, 2], r[0, 2] - r[2, 0], r[1, 0] - r[0, 1]
+        quat[3] = 1 + trace
+    else:
+        i, j = (k + 1) % 3, (k + 2) % 3
+        quat[k] = 1 - trace + 2 * r[k, k]
+        quat[i], quat[j] = r[i, k] + r[k, i], r[j, k] + r[k, j]
+        quat[3] = r[j, i] - r[i, j]
+    return quat / math.sqrt(quat[0] ** 2 + quat[1] ** 2 + quat[2] ** 2 + quat[3] ** 2)
+
+
+@compiled
 def so3_exp(w: Floats) -> Floats:
     """Rotation [3, 3] of a rotation vector [3], rad: I + sin θ/θ W + (1 - cos θ)/θ² W² (Rodrigues)."""
     first, second, _ = _exponential_factors(_length(w))

@@ -15,6 +15,7 @@ from typing import Any
 
 import cv2
 import fake_ranges
+import fake_semidirect
 import fake_steps
 import numpy as np
 import pytest
@@ -24,6 +25,8 @@ import readers
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
 from pipelines.ranging.step import RangeStep
+from pipelines.semidirect.baseline_step import BaselineStep
+from pipelines.semidirect.step import SemidirectStep
 from pipelines.verdict import Severity, Verdict
 from readers.streams import ImageSample, RecordingError, ScalarSample, WorkbenchError
 from workbench import rrd, traces
@@ -478,6 +481,8 @@ def test_a_second_close_does_nothing(tmp_path: Path) -> None:
 RUNS: dict[type[Step], tuple[Callable[[int], Iterable[Step]], set[str]]] = {
     CorrelationStep: (fake_steps.steps, {"Correlation surfaces", "Second / first"}),
     RangeStep: (fake_ranges.steps, {"Ranges Z, m", "Ranges: 0.5 m red to 50 m blue"}),
+    BaselineStep: (fake_semidirect.baseline_steps, {"Corners of the frame", "Map: path blue, reference green"}),
+    SemidirectStep: (fake_semidirect.steps, {"Alignment cost, grey²", "Filters by outcome"}),
 }
 
 

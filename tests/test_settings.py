@@ -170,7 +170,7 @@ def test_estimators_come_from_entry_points_too(monkeypatch: pytest.MonkeyPatch) 
         return [p for p in points if name in (None, p.name)]
 
     monkeypatch.setattr(workbench.settings, "entry_points", fake)
-    assert estimator_names() == ("correlation", "range", "broken", "odd", "own", "toy")
+    assert estimator_names() == ("correlation", "range", "semidirect", "ptam", "broken", "odd", "own", "toy")
     assert plugin("toy") is TOY
     assert plugin("own") is TOY
     with pytest.raises(SettingsError, match="cannot be loaded: gone"):

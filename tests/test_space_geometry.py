@@ -5,7 +5,7 @@ import pytest
 from scipy.linalg import expm
 from scipy.spatial.transform import Rotation
 
-from pipelines.geometry import hat, se3_exp, se3_inverse, se3_log, se3_product, so3_exp, so3_log
+from pipelines.geometry import hat, quat_of_rotation, se3_exp, se3_inverse, se3_log, se3_product, so3_exp, so3_log
 
 ANGLES = [0.0, 1e-9, 1e-5, 5e-3, 2e-2, 0.7, 2.0, 2.6, 3.0, np.pi - 1e-4, np.pi - 1e-9]
 
@@ -31,6 +31,16 @@ def test_exponentials_and_logarithms(angle: float, seed: int) -> None:
     assert np.allclose(so3_exp(xi[3:]), Rotation.from_rotvec(xi[3:]).as_matrix(), atol=1e-14)
     assert np.allclose(so3_log(so3_exp(xi[3:])), xi[3:], atol=1e-9)
     assert np.allclose(se3_log(se3_exp(xi)), xi, atol=1e-9)
+
+
+@pytest.mark.parametrize("angle", ANGLES)
+@pytest.mark.parametrize("seed", range(6))
+def test_quaternions_of_rotations(angle: float, seed: int) -> None:
+    rotation = Rotation.from_rotvec(twist(angle, seed)[3:])
+    found = quat_of_rotation(rotation.as_matrix())
+    assert found[np.argmax(np.abs(found))] > 0
+    assert np.linalg.norm(found) == pytest.approx(1, abs=1e-15)
+    assert (Rotation.from_quat(found) * rotation.inv()).magnitude() < 1e-14
 
 
 def test_inverse_and_product() -> None:

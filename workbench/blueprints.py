@@ -16,12 +16,15 @@ from numpy.typing import NDArray
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
 from pipelines.ranging.step import RangeStep
+from pipelines.semidirect.step import SemidirectStep, VisualStep
 
 FIELD_OF_VIEW = math.radians(55)
 """Of the viewer's eye, from top to bottom."""
 ASPECT = 1.35
 """Width over height of the map, at least."""
 MARGIN = 1.3
+FOLLOWED_SHOWN = 4
+"""Depth filters whose course the view shows side by side."""
 MOST_LANES = 3
 """Lanes of verdicts that stand side by side."""
 
@@ -80,6 +83,7 @@ class Bounds:
         surfaces_px: width and height of the mosaic of correlation surfaces.
         landmarks: of the range filter: slot, name, and upper end of the plot of ranges in m (0: the viewer's choice).
         smoothed: slots, from 1, of which there are smoothed ranges.
+        height_m: of the highest camera over the ground, for views in space.
     """
 
     frames: tuple[int, int] | None = None
@@ -88,6 +92,7 @@ class Bounds:
     surfaces_px: tuple[float, float] | None = None
     landmarks: tuple[tuple[int, str, float], ...] = ()
     smoothed: frozenset[int] = frozenset()
+    height_m: float = 0.0
 
 
 def sensor_blueprint(bounds: Bounds) -> rrb.Blueprint:
@@ -112,6 +117,8 @@ def blueprint_of(step_type: type[Step], run: str, estimator: str, bounds: Bounds
         return correlation_blueprint(run, estimator, bounds)
     if issubclass(step_type, RangeStep):
         return range_blueprint(run, estimator, bounds)
+    if issubclass(step_type, VisualStep):
+        return visual_blueprint(step_type, run, estimator, bounds)
     return rrb.Blueprint(*_panels(), auto_views=True, auto_layout=True)
 
 
@@ -299,6 +306,156 @@ def _slot_colour(slot: int) -> int:
     """RGBA of a landmark's slot, hues by the golden section."""
     rgb = colorsys.hsv_to_rgb((0.57 + slot * 0.618) % 1, 0.6, 0.95)
     return sum(int(c * 255) << shift for c, shift in zip(rgb, (24, 16, 8), strict=True)) | 0xFF
+
+
+def visual_blueprint(step_type: type[Step], run: str, estimator: str, bounds: Bounds | None = None) -> rrb.Blueprint:
+    """Image and map above; plots and texts in the middle; lanes of verdicts and stages at the foot."""
+    bounds = bounds or Bounds()
+    root, image = f"/runs/{run}/{estimator}", f"/camera/image/{run}"
+    semidirect = issubclass(step_type, SemidirectStep)
+    pictures: dict[str, tuple[str, ...]] = {
+        "Image: matched green, failed by cause, predicted white": ("predicted", "features", "missed")
+    }
+    if semidirect:
+        pictures["Filters: epipolar segments by outcome"] = ("epipolar", "filters")
+        pictures["Alignment: patches, green to red by residual"] = ("patches",)
+    images = [
+        _image("/camera/image", bounds.image_px, name, contents=["/camera/image", *(f"{image}/{one}" for one in drawn)])
+        for name, drawn in pictures.items()
+    ]
+    lanes = [f"{root}/verdict", f"{root}/stage", f"{root}/verdicts/**"]
+    return rrb.Blueprint(
+        rrb.Vertical(
+            rrb.Horizontal(rrb.Tabs(*images), _visual_maps(run, bounds), column_shares=[5, 6]),
+            rrb.Horizontal(
+                _visual_plots(root, bounds.frames, semidirect=semidirect),
+                _texts(run, root, _lags(bounds.frames)),
+                column_shares=[3, 2],
+            ),
+            rrb.StateTimelineView(origin=root, contents=lanes, name="Verdicts", time_view=_axis(bounds.frames)),
+            row_shares=[10, 8, 5],
+        ),
+        *_panels(),
+        auto_views=False,
+    )
+
+
+def _visual_maps(run: str, bounds: Bounds) -> rrb.Tabs:
+    """The map in space, with the reference laid over the path, and from above, with the reference as it is."""
+    world = f"/world/runs/{run}"
+    hidden: dict[Any, Any] = {f"{world}/map/sigma": rrb.EntityBehavior(visible=False)}
+    eye = None
+    if bounds.extent is not None:
+        reach = bounds.extent.size_m + 2 * bounds.height_m
+        eye = rrb.EyeControls3D(
+            position=(bounds.extent.x_m - 0.25 * reach, bounds.extent.y_m - 0.55 * reach, 0.5 * reach),
+            look_target=(bounds.extent.x_m, bounds.extent.y_m, bounds.height_m / 2),
+            eye_up=(0.0, 0.0, 1.0),
+        )
+    space = rrb.Spatial3DView(
+        origin="/world",
+        contents=[f"{world}/**", f"- {world}/above/**", "/world/scale"],
+        name="Space: points by σ, keyframes orange, reference green",
+        eye_controls=eye,
+        overrides=hidden,
+        background=[18, 20, 24],
+    )
+    above = _map(
+        run, bounds.extent, "Map: path blue, reference green", ("above/path",),
+        ["/world/reference/**", "/world/scale", *(f"{world}/{one}" for one in _FROM_ABOVE)],
+    )  # fmt: skip
+    return rrb.Tabs(space, above)
+
+
+_FROM_ABOVE = ("above/**", "map/points")
+_VISUAL_PLOTS: Mapping[str, Sequence[tuple[str, str]]] = {
+    "Tracking": (
+        ("Points that agree with the pose", "tracked"),
+        ("Reprojection error, px: median, 90 %", "features/error"),
+        ("Frames since the relocalisation, number of the map", "map/number"),
+    ),
+    "Map": (
+        ("Keyframes and points", "map/size"),
+        ("Median depth of the scene", "map/scene_depth"),
+        ("Frame became a keyframe", "keyframe/made"),
+    ),
+    "Scale": (("Metres a unit of the first map", "scale/metres_per_unit"),),
+    "Pose": (("Camera in the world", "pose/position"), ("Standard deviations", "pose/sigma")),
+}
+_BASELINE_PLOTS: Mapping[str, Sequence[tuple[str, str]]] = {
+    "Search": (
+        ("Corners of the frame", "tracking/corners"),
+        ("Coarse step: points tried and found", "tracking/coarse"),
+    ),
+    "Keyframes": (
+        ("Distance to the nearest keyframe / depth", "keyframe/distance"),
+        ("Points added and removed", "structure/changed"),
+        ("Bundle: cost, px²", "bundle/cost"),
+    ),
+    "Times": (("Time of the stages, ms", "work/stages"),),
+}
+_SEMIDIRECT_PLOTS: Mapping[str, Sequence[tuple[str, str]]] = {
+    "Alignment": (
+        ("Alignment cost, grey²", "alignment/level"),
+        ("Iterations by level", "alignment/iterations"),
+        ("Patches and inliers", "alignment/patch_count"),
+    ),
+    "Refinement": (
+        ("Error before, after, and its scale, px", "refinement/error"),
+        ("Points by what became of them", "features/count"),
+    ),
+    "Keyframes": (
+        ("Distance to the nearest keyframe / depth", "keyframe/distance"),
+        ("Points added and removed", "structure/changed"),
+        ("Bundle", "bundle/size"),
+    ),
+    "Filters": (
+        ("Filters by outcome", "filters/count"),
+        ("Filters at work", "filters/number"),
+        ("Median σ/z_range and a/(a+b)", "filters/spread"),
+    ),
+    "Height": (("Height: sensor, and over the map, m", "scale/height"),),
+    "Times": (("Time of the stages, ms", "work/stages"),),
+}
+
+
+def _visual_plots(root: str, frames: tuple[int, int] | None, *, semidirect: bool) -> rrb.Tabs:
+    def plot(
+        name: str, entities: Sequence[str], *, show: Sequence[bool] = (), legend: bool = True
+    ) -> rrb.TimeSeriesView:
+        lines = rr.SeriesLines.from_fields(visible_series=list(show))
+        return rrb.TimeSeriesView(
+            origin=root,
+            contents=[f"{root}/{entity}" for entity in entities],
+            name=name,
+            axis_x=_axis(frames),
+            overrides={f"{root}/{entity}": lines for entity in entities} if show else {},
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
+        )
+
+    groups = {**_VISUAL_PLOTS, **(_SEMIDIRECT_PLOTS if semidirect else _BASELINE_PLOTS)}
+    tabs: list[Any] = [
+        rrb.Horizontal(*(plot(name, [entity]) for name, entity in plots), name=tab) for tab, plots in groups.items()
+    ]
+    if semidirect:
+        slots = range(1, FOLLOWED_SHOWN + 1)
+        tabs.insert(
+            7,
+            rrb.Grid(
+                *(plot(f"Filter of slot {k}: μ ± σ, 1/m", [f"filters/shown/{k}/depth"], legend=False) for k in slots),
+                *(plot(f"Slot {k}: a/(a+b), C1", [f"filters/shown/{k}/ratio"], legend=False) for k in slots),
+                grid_columns=FOLLOWED_SHOWN,
+                name="One filter",
+            ),
+        )
+    tabs.append(
+        rrb.Horizontal(
+            plot("Position error, m (x blue, y orange, distance white)", ["error"], show=[True, True, True, False]),
+            plot("Heading error, rad", ["error"], show=[False, False, False, True]),
+            name="Errors",
+        )
+    )
+    return rrb.Tabs(*tabs)
 
 
 def _panels() -> Sequence[Any]:

@@ -441,7 +441,10 @@ def replay(
         str | None, typer.Option(metavar="TOPIC", help="Range: pixel tracks or measured landmarks [the only ones].")
     ] = None,
     odometry: Annotated[
-        str | None, typer.Option(metavar="TOPIC", help="Range: odometry with the speed [the only one].")
+        str | None,
+        typer.Option(
+            metavar="TOPIC", help="Range: odometry with the speed [the only one]; visual odometry: its scale."
+        ),
     ] = None,
     imu: Annotated[
         str | None, typer.Option(metavar="TOPIC", help="Range: IMU with the rate of turn, or none [the only one].")

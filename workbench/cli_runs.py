@@ -195,7 +195,7 @@ def _print_explanation(run: Run, one: Explanation, judgement: Judgement) -> None
 
 
 def _by_place(run: Run) -> Any:
-    order = {name: place for place, name in enumerate(run.fields)}
+    order = {name: place for place, name in enumerate((*run.fields, *run.lists))}
     return lambda quantity: order[quantity.field]
 
 

@@ -16,6 +16,7 @@ from pipelines.planar import wrap_angles
 from readers.streams import RecordingError, WorkbenchError
 from workbench.metrics import metrics
 from workbench.runs import Run
+from workbench.schema import CLOCKED, Archetype
 
 Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -38,7 +39,7 @@ class Parting:
         run: name of the run, and of the one that it is compared with.
         other: that one.
         frames: how many frames both have.
-        identical: whether every number that both have is equal, bit for bit.
+        identical: whether every number that both have is equal, bit for bit, but for times that a clock tells.
         first_different: the first frame at which any number differs, -1 for none.
         field: a field that differs there.
         first_verdict: the first frame with another verdict, -1 for none.
@@ -170,8 +171,10 @@ def parting(first: Run, run: Run) -> Parting:
 def _first_different(first: Run, run: Run, i: Ints, j: Ints) -> tuple[int, str]:
     """The first common row at which any number differs, and a field that does; -1 where none does."""
     earliest, name = len(i), ""
+    for one in (first, run):
+        one.columns(one.fields)  # in one pass over the file
     for field in first.fields:
-        if field not in run.fields:
+        if field not in run.fields or field in CLOCKED:
             continue
         a, b = first.column(field)[i[:earliest]], run.column(field)[j[:earliest]]
         if a.shape != b.shape:
@@ -182,7 +185,22 @@ def _first_different(first: Run, run: Run, i: Ints, j: Ints) -> tuple[int, str]:
             earliest, name = int(rows[0]), field
         if not earliest:
             break
+    for group in first.schema.of(Archetype.LISTS).values():
+        names = [one.field for one in group if one.field in run.lists]
+        lists, others = first.list_columns(names), run.list_columns(names)
+        for field in names:
+            row = _first_unequal(lists[field], others[field], i[:earliest], j[:earliest])
+            if row >= 0:
+                earliest, name = row, field
     return (earliest, name) if name else (-1, "")
+
+
+def _first_unequal(lists: NDArray[Any], others: NDArray[Any], i: Ints, j: Ints) -> int:
+    """The first of some pairs of rows whose lists differ, -1 for none."""
+    for row, (a, b) in enumerate(zip(i, j, strict=True)):
+        if not np.array_equal(lists[a], others[b], equal_nan=True):
+            return row
+    return -1
 
 
 def _differences(first: Run, run: Run, i: Ints, j: Ints) -> tuple[Floats, Sequence[float]]:

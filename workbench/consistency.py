@@ -23,7 +23,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.drift import DriftBudget
+from pipelines.estimator import Step
 from pipelines.evaluation import Trajectory
+from pipelines.semidirect.step import VisualStep
 from pipelines.verdict import Verdict
 from readers.streams import Recording, RecordingError, Sample, StreamInfo
 from workbench.runs import Run
@@ -158,6 +160,9 @@ def consistency(run: Run, on_progress: OnProgress | None = None) -> Consistency:
     if path is None:
         problem = f"is a run of {run.estimator}, which has no path to hold against itself"
         raise RecordingError(run.file, problem, "give a run of an estimator of the vehicle's path, such as correlation")
+    if run.visual and run.summary.get("unit") != "m":
+        problem = f"is a run of {run.estimator} of unknown scale, and each replay would have a unit of its own"
+        raise RecordingError(run.file, problem, "replay it with a height: --height STREAM, or --set height_m=…")
     told = on_progress or (lambda _title, _done, _total: None)
     height = getattr(run.model, "height_stream", "")
     with sensors_of(run) as sensors:
@@ -216,6 +221,12 @@ class Logged(Recording):
         self._sensors.close()
 
 
+def _pose_of(step: Step) -> Floats:
+    """The pose of a step [3]; NaN where a visual odometry holds the last one."""
+    pose: Floats = step.pose  # type: ignore[attr-defined]  # a run with a path has it
+    return np.full(3, np.nan) if isinstance(step, VisualStep) and not step.accepted else pose
+
+
 def _replayed(run: Run, sensors: SensorReader, backward: Recording, on_progress: OnProgress) -> Trajectory:
     """The path of the replay of a recording whose time runs backward, at its own times."""
     from pipelines.replay import stepped
@@ -225,7 +236,7 @@ def _replayed(run: Run, sensors: SensorReader, backward: Recording, on_progress:
     for sample in backward.read():
         state, step = stepped(estimator, state, sensors.decoded(sample))
         if step is not None:
-            steps.append((step.t_ns, step.pose))  # type: ignore[attr-defined]  # a run with a path has it
+            steps.append((step.t_ns, _pose_of(step)))
             on_progress("backward", len(steps), len(run.frames))
     return Trajectory.of([t_ns for t_ns, _ in steps], np.array([pose for _, pose in steps]))
 

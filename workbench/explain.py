@@ -104,7 +104,7 @@ class Explanation:
         alarms: name and sentence of every alarm.
         error: errors against the reference, x, y, distance (m), heading (rad); None without one.
         harm_m: what the frame adds to the end-point error, NaN where that is not known.
-        quantities: all fields, the most unusual first.
+        quantities: all fields, the most unusual first; last the lists, which are not judged.
         neighbours: the frames around.
         followed: the names of the quantities that `neighbours` tell.
         findings: the findings that it belongs to.
@@ -160,6 +160,7 @@ def explain(
     at = int(np.searchsorted(columns["frame"], frame))
     rows = _sample_of(columns["frame"])
     judged = sorted((_judged(run, name, columns[name], at, rows) for name in run.fields), key=_order)
+    judged += [_unjudged(run, name, values) for name, values in run.lists_at(frame).items()]
     told = [q for q in judged if q.odd and math.isfinite(q.value)][:followed]
     near = run.frames[max(0, row - around) : row + around + 1]
     return Explanation(
@@ -227,6 +228,24 @@ def _judged(run: Run, name: str, column: NDArray[Any], row: int, rows: NDArray[n
         stands_out=found.stands_out,
         drifts=at is not None and bool(found.drifts[at]),
         change=math.nan if at is None else float(found.change[at]),
+    )
+
+
+def _unjudged(run: Run, name: str, values: NDArray[Any]) -> Quantity:
+    """A list: its numbers are others in every frame, so that none of them has a usual value."""
+    about = quantities(run.step_type)[name]
+    nothing = math.nan
+    return Quantity(
+        field=name,
+        unit=about["unit"],
+        meaning=about["meaning"],
+        values=values,
+        at=(),
+        value=nothing,
+        usual=nothing,
+        z=nothing,
+        rarity=nothing,
+        stands_out=nothing,
     )
 
 

@@ -64,7 +64,8 @@ def _trajectory(run: Run, folder: Path, ending: str) -> Path:
     if path is None:
         raise ExportError(f"{run.file}: {run.estimator} has no trajectory, so there is no {ending} file of it")
     file = folder / f"{run.name}.{ending}"
-    {"tum": write_tum, "kitti": write_kitti}[ending](file, SpatialPath.of_plane(path))
+    in_space = run.path_in_space
+    {"tum": write_tum, "kitti": write_kitti}[ending](file, SpatialPath.of_plane(path) if in_space is None else in_space)
     return file
 
 

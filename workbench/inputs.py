@@ -391,7 +391,7 @@ def with_scale(
     else:
         values["focal_px"] = focal_px
         scale = Scale("m", f"{height} over {focal}")
-    return _with(resolved, values), scale, notes
+    return filled(resolved, values), scale, notes
 
 
 def _focal(settings: Any, camera: Camera | None, size_px: tuple[int, int]) -> tuple[float | None, str, list[str]]:
@@ -437,6 +437,20 @@ def camera_sentence(camera: Camera) -> str:
     return f"camera: {size}f {fx:.6g} {fy:.6g}, centre {cx:.6g} {cy:.6g}, {bent}, of {source_of(camera)}"
 
 
+def intrinsics(camera: Camera) -> dict[str, Any]:
+    """The settings of a camera's intrinsics."""
+    values: dict[str, Any] = {
+        "focal_px": float(camera.matrix[0, 0]),
+        "focal_y_px": float(camera.matrix[1, 1]),
+        "centre_px": (float(camera.matrix[0, 2]), float(camera.matrix[1, 2])),
+        "distortion_model": camera.distortion_model,
+        "distortion": tuple(float(v) for v in camera.distortion),
+    }
+    if camera.width_px and camera.height_px:
+        values["image_size_px"] = (camera.width_px, camera.height_px)
+    return values
+
+
 def _height(settings: Any, recording: Recording, stream: str) -> tuple[dict[str, Any], str]:
     """The settings for the height, and what it comes from (empty for unknown)."""
     stream = stream or settings.height_stream
@@ -477,10 +491,11 @@ def with_start(resolved: Resolved, reference: Reference, first_ns: int) -> Resol
     at = associate(np.array([first_ns]), path)[0]
     pose = at if np.isfinite(at[0]) else path.pose[0]
     heading = float(pose[2]) if math.isfinite(pose[2]) else settings.start_pose[2]
-    return _with(resolved, {"start_pose": (float(pose[0]), float(pose[1]), heading)})
+    return filled(resolved, {"start_pose": (float(pose[0]), float(pose[1]), heading)})
 
 
-def _with(resolved: Resolved, values: dict[str, Any]) -> Resolved:
+def filled(resolved: Resolved, values: dict[str, Any]) -> Resolved:
+    """The same settings with some values of the recording; what the user gave stays noted as given."""
     settings = validated(resolved.settings, [Layer("the recording", values)]).settings
     return Resolved(settings, resolved.given)
 

@@ -2,7 +2,7 @@
 
 Names are dotted: ``frames``, ``verdict.PEAK_AMBIGUOUS`` and ``alarm.…`` (frames), ``share.OK`` (%),
 ``drift_percent``, ``ape_m.rmse``, ``rpe.1 s.translation_m.rmse``, ``ranging.error.median_percent``,
-``finding.motion-blur`` and ``findings.error`` (how many).
+``odometry.losses``, ``finding.motion-blur`` and ``findings.error`` (how many).
 """
 
 from __future__ import annotations
@@ -17,6 +17,8 @@ from readers.streams import WorkbenchError
 from workbench.diagnosis.finding import Finding
 
 COUNTED = {"verdicts": "verdict", "alarms": "alarm"}
+EPISODES = ("losses", "relocalised", "starts")
+"""Of a visual odometry: how often."""
 NOT_NUMBERS = ("total", "matched")
 
 
@@ -47,6 +49,9 @@ def metrics(summary: Mapping[str, Any], findings: Iterable[Finding] | None = Non
     found |= _flat(evaluation, "")
     if "ranging" in summary:
         found |= _flat({k: v for k, v in summary["ranging"].items() if k != "per_landmark"}, "ranging.")
+    if "odometry" in summary:
+        found |= _flat(summary["odometry"], "odometry.")
+        found |= {f"odometry.{name}": float(len(summary["odometry"][name])) for name in EPISODES}
     if findings is not None:
         found |= _of_findings(list(findings))
     return found

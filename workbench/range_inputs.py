@@ -27,7 +27,17 @@ from readers.streams import (
     StreamKind,
     TextSample,
 )
-from workbench.inputs import NONE, Reference, camera_sentence, choose_images, kinds, names, of_kind, other_size
+from workbench.inputs import (
+    NONE,
+    Reference,
+    camera_sentence,
+    choose_images,
+    intrinsics,
+    kinds,
+    names,
+    of_kind,
+    other_size,
+)
 from workbench.inputs import load_reference as load_any_reference
 from workbench.settings import Layer, Resolved, validated
 
@@ -215,7 +225,7 @@ def with_camera(
     values: dict[str, Any] = {}
     notes = []
     if settings.focal_px is None:
-        values = _intrinsics(camera)
+        values = intrinsics(camera)
         notes += [camera_sentence(camera), *_size_notes(recording, camera, streams)]
     if np.isfinite(camera.body_t_camera).all():
         turn, place = camera.body_t_camera[:3, :3], camera.body_t_camera[:3, 3]
@@ -262,20 +272,6 @@ def _only_surveyed(resolved: Resolved, recording: Recording) -> Resolved:
 
 
 _ANGLES = frozenset({"camera_yaw_rad", "camera_pitch_rad", "camera_roll_rad"})
-
-
-def _intrinsics(camera: Camera) -> dict[str, Any]:
-    """The settings of a camera's intrinsics."""
-    values: dict[str, Any] = {
-        "focal_px": float(camera.matrix[0, 0]),
-        "focal_y_px": float(camera.matrix[1, 1]),
-        "centre_px": (float(camera.matrix[0, 2]), float(camera.matrix[1, 2])),
-        "distortion_model": camera.distortion_model,
-        "distortion": tuple(float(v) for v in camera.distortion),
-    }
-    if camera.width_px and camera.height_px:
-        values["image_size_px"] = (camera.width_px, camera.height_px)
-    return values
 
 
 # -------------------------------------------------------------------------- landmarks, reference

@@ -29,6 +29,8 @@ from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step
 from pipelines.planar import heading_of_quat
 from pipelines.ranging.step import RangeStep
+from pipelines.semidirect.baseline_step import BaselineStep
+from pipelines.semidirect.step import SemidirectStep
 from pipelines.verdict import Severity, Verdict
 from readers.streams import ImageError, ImageSample, PoseSample, RecordingError, Sample
 from workbench import traces
@@ -46,15 +48,17 @@ from workbench.rrd_file import (
     blobs,
     document,
     flat,
+    lists,
     marker,
     numbers,
     texts,
 )
 from workbench.rrd_ranges import RangeDrawing
-from workbench.rrd_reading import around, chunks
+from workbench.rrd_reading import around, chunks, listed
 from workbench.rrd_reading import merge as merge
 from workbench.rrd_reading import recover as recover
 from workbench.rrd_samples import SampleLog, is_grey
+from workbench.rrd_semidirect import SemidirectDrawing, VisualDrawing
 from workbench.schema import Archetype, Row, Schema, schema_of
 
 if TYPE_CHECKING:
@@ -68,7 +72,12 @@ Floats = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
 
-_DRAWINGS: Mapping[type[Step], type[Drawing]] = {CorrelationStep: CorrelationDrawing, RangeStep: RangeDrawing}
+_DRAWINGS: Mapping[type[Step], type[Drawing]] = {
+    CorrelationStep: CorrelationDrawing,
+    RangeStep: RangeDrawing,
+    SemidirectStep: SemidirectDrawing,
+    BaselineStep: VisualDrawing,
+}
 
 
 class _Writer(abc.ABC):
@@ -392,6 +401,9 @@ class RunWriter(_Writer):
         for entity, rows in self._schema.of(Archetype.INTEGERS).items():
             integers = {row.field: table[row.field] for row in rows}
             self._send(entity, table, rr.DynamicArchetype.columns(Archetype.INTEGERS.value, components=integers))
+        for entity, rows in self._schema.of(Archetype.LISTS).items():
+            joined = {row.field: traces.Joined.of(table[row.field]) for row in rows}
+            self._send(entity, table, lists(Archetype.LISTS.value, joined))
 
     def _verdicts(self, table: traces.Columns) -> None:
         events, changes = self._changes.take(table)
@@ -491,6 +503,9 @@ def read_fields(
         elif row.archetype is Archetype.SURFACES:
             formats = rows[row.entity, _FORMAT][2]
             table[row.field] = _surfaces(rows[row.entity, row.component][2], formats, table)
+    table |= listed(
+        schema, {row.field: rows[row.entity, row.component][2] for row in needed if row.field in schema.lists}
+    )
     return {field: table[field] for field in wanted}
 
 

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import math
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -102,6 +103,17 @@ def repeated(column: rr.ComponentColumnList, count: int) -> rr.ComponentColumnLi
         values = one.component_batch.as_arrow_array().take(pa.array(np.zeros(count, np.int64)))
         repeated.append(rr.ComponentColumn(one.component_descriptor(), _Arrow(values)))
     return rr.ComponentColumnList(repeated)
+
+
+def lists(archetype: str, components: Mapping[str, traces.Joined]) -> rr.ComponentColumnList:
+    """Components whose rows differ in length, also where all of them are empty; int64 or float64 as they are."""
+    made = []
+    for name, joined in components.items():
+        flat = np.ascontiguousarray(joined.values).reshape(-1)
+        width = math.prod(joined.values.shape[1:])
+        descriptor = rr.ComponentDescriptor(name).with_builtin_archetype(archetype)
+        made.append(rr.ComponentColumn(descriptor, _Arrow(pa.array(flat))).partition(joined.counts * width))
+    return rr.ComponentColumnList(made)
 
 
 class _Arrow:

@@ -23,6 +23,7 @@ from rerun.chunk import RrdReader
 from readers.streams import RecordingError
 from workbench.rrd_file import numbers
 from workbench.schema import Archetype, Row, Schema
+from workbench.traces import objects
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -120,24 +121,18 @@ def _rows(column: pa.ListArray) -> NDArray[Any]:
     # flatten() loads Arrow's functions, which takes longer than most commands; only rows that are null need it
     flat = column.flatten() if column.null_count else column.values[int(offsets[0]) : int(offsets[-1])]
     if not (pa.types.is_integer(flat.type) or pa.types.is_floating(flat.type)):
-        return _objects(column.to_pylist())
+        return objects(column.to_pylist())
     values = numbers(flat)
     if len(lengths) and (lengths == lengths[0]).all():
         return values.reshape(len(lengths), int(lengths[0]))
-    return _objects(np.split(values, np.cumsum(lengths)[:-1]))
-
-
-def _objects(items: Sequence[Any]) -> NDArray[Any]:
-    array = np.empty(len(items), object)
-    array[:] = items
-    return array
+    return objects(np.split(values, np.cumsum(lengths)[:-1]))
 
 
 def _stacked(parts: Sequence[NDArray[Any]]) -> NDArray[Any]:
     """Rows one after another; [n] of arrays where their lengths differ."""
     if all(part.ndim == 2 and part.shape[1] == parts[0].shape[1] for part in parts):
         return np.concatenate(parts)
-    ragged: NDArray[Any] = np.concatenate([_objects(list(part)) for part in parts])
+    ragged: NDArray[Any] = np.concatenate([objects(list(part)) for part in parts])
     return ragged
 
 
@@ -149,6 +144,8 @@ def columns(
     choose: Callable[[Sequence[Any]], Iterable[Any]] | None = None,
 ) -> dict[str, NDArray[Any]]:
     """Fields of all steps of a run as arrays [n, *shape], with ``frame`` and ``t_ns`` [n]; surfaces are not for it.
+
+    Lists are arrays [n] of arrays.
 
     Frames that lack one of the fields' entities are left out: they stood at the torn end of a file. Where the shape
     changes within a run, the fields of the steps with fewer numbers are filled up with NaN at the end.
@@ -186,7 +183,19 @@ def columns(
     for row in needed:
         if row.archetype is Archetype.INTEGERS:
             found[row.field] = rows[row.entity, row.component].values[:, 0]
+    lists = {row.field: list(rows[row.entity, row.component].values) for row in needed if row.field in schema.lists}
+    found |= {name: objects(values) for name, values in listed(schema, lists).items()}
     return {name: found[name] for name in ("frame", "t_ns", *wanted) if name in found}
+
+
+def listed(schema: Schema, flat: Mapping[str, Sequence[NDArray[Any]]]) -> dict[str, list[NDArray[Any]]]:
+    """Lists as they lie in a file, one row of numbers a frame, as the fields' arrays."""
+    found = {}
+    for field, values in flat.items():
+        lead = schema.leading(field)
+        lengths = map(len, flat[lead]) if lead else itertools.repeat(-1, len(values))
+        found[field] = [schema.listed(field, row, rows) for row, rows in zip(values, lengths, strict=True)]
+    return found
 
 
 def _common(one: Ints, other: Ints) -> Ints:
@@ -228,7 +237,10 @@ def _split(schema: Schema, rows: Sequence[Row], values: NDArray[Any]) -> dict[st
             found[row.field] = part.reshape(len(values), *fixed) if shape else part[:, 0]
         start += width
     kinds = schema.kinds
-    return {name: array.astype(np.int64) if kinds[name] in (int, bool) else array for name, array in found.items()}
+    return {
+        name: array.astype(np.int64) if kinds[name] in (int, bool) or schema.whole(name) else array
+        for name, array in found.items()
+    }
 
 
 def _filled(values: NDArray[Any]) -> Floats:

@@ -22,6 +22,7 @@ from pydantic import BaseModel
 
 from pipelines.estimator import Step
 from pipelines.evaluation import Trajectory
+from pipelines.semidirect.step import VisualStep
 from pipelines.verdict import Verdict
 from readers.streams import ImageSample, RecordingError
 from workbench.schema import Archetype, Schema, schema_of
@@ -29,6 +30,8 @@ from workbench.settings import Layer, Plugin, plugin, settings_values, validated
 
 if TYPE_CHECKING:
     import pandas as pd
+
+    from pipelines.spatial import SpatialPath
 
 Ints = NDArray[np.int64]
 Floats = NDArray[np.float64]
@@ -167,11 +170,17 @@ class Run:
 
     @property
     def fields(self) -> tuple[str, ...]:
-        """The names of all fields but surfaces."""
-        return tuple(row.field for row in self.schema.rows if row.archetype is not Archetype.SURFACES)
+        """The names of all fields but surfaces and lists."""
+        apart = (Archetype.SURFACES, Archetype.LISTS)
+        return tuple(row.field for row in self.schema.rows if row.archetype not in apart)
+
+    @property
+    def lists(self) -> tuple[str, ...]:
+        """The names of the fields whose length changes from frame to frame."""
+        return self.schema.lists
 
     def columns(self, names: Iterable[str]) -> dict[str, NDArray[Any]]:
-        """Some fields of all frames, [n, *shape] each.
+        """Some fields of all frames, [n, *shape] each; lists are not for it, see `column`.
 
         Raises:
             RecordingError: the file cannot be read, or holds no such run.
@@ -202,8 +211,23 @@ class Run:
         return rrd_reading.columns(self.file, self.root, self.schema, self.fields, choose)
 
     def column(self, name: str) -> NDArray[Any]:
-        """One field of all frames, [n, *shape]; see `columns`."""
-        return self.columns([name])[name]
+        """One field of all frames, [n, *shape], see `columns`; of a list an array [n] of arrays, which is not kept.
+
+        Raises:
+            RecordingError: the file cannot be read.
+            KeyError: there is no such field.
+        """
+        return self.list_columns([name])[name] if name in self.lists else self.columns([name])[name]
+
+    def list_columns(self, names: Iterable[str]) -> dict[str, NDArray[Any]]:
+        """Some lists of all frames, an array [n] of arrays each; they are large and not kept.
+
+        Raises:
+            RecordingError: the file cannot be read.
+        """
+        from workbench import rrd_reading
+
+        return rrd_reading.columns(self.file, self.root, self.schema, names)
 
     @property
     def frames(self) -> Ints:
@@ -266,6 +290,19 @@ class Run:
                 columns[f"{name}[{','.join(map(str, index))}]" if index else name] = array[(slice(None), *index)]
         return pd.DataFrame(columns, index=pd.Index(self.frames, name="frame"))
 
+    def lists_at(self, frame: int) -> dict[str, NDArray[Any]]:
+        """The lists of one frame.
+
+        Raises:
+            RecordingError: the run has no such frame, or its file cannot be read.
+        """
+        if not self.lists:
+            return {}
+        from workbench.rrd import read_fields
+
+        found = read_fields(self.file, self.name, self.step_type, self.lists, range(frame, frame + 1))
+        return {name: values[0] for name, values in found.items()}
+
     def steps(self, first: int, stop: int) -> list[Step]:
         """The Steps of the frames `first` to before `stop`, surfaces included.
 
@@ -292,10 +329,31 @@ class Run:
 
     @functools.cached_property
     def trajectory(self) -> Trajectory | None:
-        """The estimated path, seen from above; None of an estimator that has none."""
+        """The estimated path, seen from above; None of an estimator that has none.
+
+        Of a visual odometry only frames whose pose was found; the others hold the last one.
+        """
         if "pose" not in self.fields:
             return None
-        return Trajectory.of(self.t_ns, self.column("pose"))
+        pose = self.column("pose")
+        if self.visual:
+            pose = np.where(self.column("accepted").astype(bool)[:, None], pose, np.nan)
+        return Trajectory.of(self.t_ns, pose)
+
+    @property
+    def visual(self) -> bool:
+        """Whether it is of a visual odometry with a map."""
+        return issubclass(self.step_type, VisualStep)
+
+    @functools.cached_property
+    def path_in_space(self) -> SpatialPath | None:
+        """The estimated path in space, of frames whose pose was found; None of an estimator that has only the plane."""
+        from pipelines.spatial import SpatialPath
+
+        if not self.visual:
+            return None
+        found = self.column("accepted").astype(bool)
+        return SpatialPath.of(self.t_ns[found], self.column("position_m")[found], self.column("quat_xyzw")[found])
 
     @functools.cached_property
     def reference_depths(self) -> Floats | None:

@@ -3,7 +3,9 @@
 An entity path here is relative to the root of a run, ``/runs/RUN/ESTIMATOR``. Unit, shape and meaning
 are those that the Step declares (`pipelines.estimator.quantities`) and are not repeated here. Fields
 that share an entity form one group of series, in the order of the rows; a field whose length the
-settings decide (a letter in its shape) has its entity to itself. `docs/schema.md` is made from this.
+settings decide (a letter in its shape) has its entity to itself. Fields whose length changes from frame to
+frame are lists: one row a frame of as many numbers as there are, whole numbers as such, row by row of the
+field's array. `docs/schema.md` is made from this.
 """
 
 from __future__ import annotations
@@ -15,11 +17,16 @@ import math
 from collections.abc import Collection, Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple, get_args, get_type_hints
+
+import numpy as np
+from numpy.typing import NDArray
 
 from pipelines.correlation.step import CorrelationStep
 from pipelines.estimator import Step, quantities
 from pipelines.ranging.step import RangeStep
+from pipelines.semidirect.baseline_step import BaselineStep
+from pipelines.semidirect.step import Feature, SemidirectStep
 from readers.streams import WorkbenchError
 
 
@@ -29,6 +36,7 @@ class Archetype(enum.StrEnum):
     TIMELINE = "timeline"
     SCALARS = "Scalars:scalars"
     INTEGERS = "Integers"
+    LISTS = "Lists"
     SURFACES = "DepthImage:buffer"
 
 
@@ -58,7 +66,7 @@ class Row:
         match self.archetype:
             case Archetype.TIMELINE:
                 return ""
-            case Archetype.INTEGERS:
+            case Archetype.INTEGERS | Archetype.LISTS:
                 return f"{self.archetype.value}:{self.field}"
         return self.archetype.value
 
@@ -95,9 +103,38 @@ class Schema:
         return next(row.entity for row in self.rows if row.field == field)
 
     def sharing(self, fields: Collection[str]) -> tuple[Row, ...]:
-        """The rows of these fields and of all that share an entity with them."""
-        entities = {(row.archetype, row.entity) for row in self.rows if row.field in fields}
-        return tuple(row for row in self.rows if (row.archetype, row.entity) in entities)
+        """The rows of these fields and of all that are needed to tell them apart or their shapes."""
+        wanted = {*fields, *map(self.leading, fields)}
+        entities = {(row.archetype, row.entity) for row in self.rows if row.field in wanted}
+        return tuple(
+            row
+            for row in self.rows
+            if (row.archetype, row.entity) in entities and (row.archetype is not Archetype.LISTS or row.field in wanted)
+        )
+
+    @functools.cached_property
+    def lists(self) -> tuple[str, ...]:
+        """The fields that are lists."""
+        return tuple(row.field for row in self.rows if row.archetype is Archetype.LISTS)
+
+    def leading(self, field: str) -> str:
+        """The field that is as long as a list of two open axes has rows; empty for all others."""
+        shape = self.shape(field) if field in self.lists else ()
+        if sum(isinstance(n, str) for n in shape) < 2:
+            return ""
+        return next(other for other in self.lists if self.shape(other) == shape[:1])
+
+    def listed(self, field: str, flat: NDArray[Any], rows: int = -1) -> NDArray[Any]:
+        """The numbers of a list as the field's array; `rows` is the length of its `leading` field."""
+        fixed = [n for n in self.shape(field) if isinstance(n, int)]
+        if not self.leading(field):
+            return flat.reshape(-1, *fixed)
+        return flat.reshape(rows, len(flat) // rows if rows else 0)
+
+    def whole(self, field: str) -> bool:
+        """Whether a field is an array of whole numbers."""
+        inner = get_args(self.kinds[field])
+        return len(inner) == 2 and get_args(inner[1]) == (np.int64,)
 
     def shape(self, field: str) -> tuple[int | str, ...]:
         """The declared shape of a field; a letter stands for a length that the settings decide."""
@@ -135,6 +172,11 @@ def _units(unit: str, count: int) -> list[str]:
     if len(parts) != count:
         return [""] * count
     return ["" if part == "1" else f" [{part}]" for part in parts]
+
+
+def _names(kind: type[enum.IntEnum]) -> tuple[str, ...]:
+    """The members of an enumeration as words, in the order of their values."""
+    return tuple(member.name.lower().replace("_", " ") for member in sorted(kind))
 
 
 _UV = ("u", "v")
@@ -275,7 +317,161 @@ RANGE = Schema(
     ),
 )  # fmt: skip
 
-SCHEMAS: Mapping[type[Step], Schema] = {CorrelationStep: CORRELATION, RangeStep: RANGE}
+_XYZ = ("x", "y", "z")
+_QUAT = ("qx", "qy", "qz", "qw")
+_TWIST = ("x", "y", "z", "rx", "ry", "rz")
+_FILTER_OUTCOMES = ("updated", "no match", "converged", "diverged", "unseen", "given up")
+"""As `depth_filter.Outcome`, which comes with compiled code, and one more."""
+_STAGES = ("pyramid", "alignment", "features and pose", "start or search", "mapping")
+_BUNDLES = ("local", "global")
+_STATES = "points `/camera/image/RUN/{}`".format
+_MAP = "`/world/runs/RUN/map/{}`".format
+_LIST = Archetype.LISTS
+
+VISUAL: tuple[Row, ...] = (
+    Row("frame", "frame", Archetype.TIMELINE),
+    Row("t_ns", "sensor_time", Archetype.TIMELINE),
+    Row("received_ns", "received", Archetype.INTEGERS),
+    Row("verdict", "outcome", also="state lane `verdict`; `events` where it changes; points of the path"),
+    Row("alarms", "outcome", also="state lanes `verdicts/NAME`; lines of `alarms`"),
+    Row("accepted", "outcome"),
+    Row("stage", "outcome", also=f"state lane `stage`; {_TABLE}"),
+    Row("dt_s", "conditions", title="dt"),
+    Row("image_size_px", "conditions", title="image", axes=("width", "height")),
+    Row("position_m", "pose/position", axes=_XYZ, title="camera", also="`/world/runs/RUN/camera`, `/corrected`"),
+    Row("quat_xyzw", "pose/rotation", axes=_QUAT, title="rotation", also="`/world/runs/RUN/camera`"),
+    Row("pose", "pose/plane", axes=_HEADING, title="pose", also="`/world/runs/RUN/above`"),
+    Row("increment_m", "motion/increment", axes=_XY, title="Δ"),
+    Row("path_step_m", "motion/increment", title="S"),
+    Row("delta_heading_rad", "motion/delta_heading", title="Δα"),
+    Row("pose_sigma", "pose/sigma", axes=_TWIST, title="σ"),
+    Row("map_number", "map/number", title="map"),
+    Row("relocalised_frames", "map/number", title="frames since the relocalisation"),
+    Row("tracked", "tracked", also=_TABLE),
+    Row("keyframe", "keyframe/made", title="keyframe"),
+    Row("keyframes", "map/size", title="keyframes"),
+    Row("map_points", "map/size", title="points"),
+    Row("scene_depth_m", "map/scene_depth", title="scene depth"),
+    Row("scale_known", "scale/known", title="scale known", also="lengths are metres, or units of the first map"),
+    Row("metres_per_unit", "scale/metres_per_unit", title="metres per unit", also=_TABLE),
+    Row("metres_per_unit_sigma", "scale/metres_per_unit", title="σ of it"),
+    Row("point_id", "features/points", _LIST),
+    Row("predicted_px", "features/points", _LIST, also=_STATES("predicted")),
+    Row("found_px", "features/points", _LIST, also=_STATES("features")),
+    Row("level", "features/points", _LIST, also="size of the points on the image"),
+    Row("outcome", "features/points", _LIST, also="colour of the points on the image"),
+    Row("error_px", "features/points", _LIST, also="`features/error`: median and largest"),
+    Row("keyframe_number", "map/keyframes", _LIST, also=_MAP("keyframes")),
+    Row("keyframe_position_m", "map/keyframes", _LIST, also=_MAP("keyframes")),
+    Row("keyframe_quat_xyzw", "map/keyframes", _LIST, also=_MAP("keyframes")),
+    Row("map_id", "map/points", _LIST),
+    Row("map_point_m", "map/points", _LIST, also=_MAP("points")),
+    Row("map_point_sigma_m", "map/points", _LIST, also=_MAP("sigma")),
+    Row("map_point_views", "map/points", _LIST),
+)
+
+_BEGINNINGS: tuple[Row, ...] = (
+    Row("start_matches", "start/matches", title="corners"),
+    Row("start_motion_px", "start/motion", title="motion"),
+    Row("start_parallax_px", "start/motion", title="parallax"),
+    Row("relocalise_keyframe", "relocalisation/keyframe", title="keyframe"),
+    Row("relocalise_correlation", "relocalisation/correlation", title="correlation"),
+)
+
+SEMIDIRECT = Schema(
+    SemidirectStep,
+    (
+        *VISUAL,
+        Row("prior_position_m", "prior/position", axes=_XYZ, title="prior"),
+        Row("prior_quat_xyzw", "prior/rotation", axes=_QUAT, title="prior"),
+        Row("align_cost", "alignment/cost", _LIST, also="`alignment/level`: before and after, of each level"),
+        Row("align_iterations", "alignment/level_work", _LIST, also="`alignment/iterations`"),
+        Row("align_stop", "alignment/level_work", _LIST, also=_TABLE),
+        Row("align_final_cost", "alignment/final_cost", title="cost"),
+        Row("align_gain", "alignment/illumination", title="gain"),
+        Row("align_offset", "alignment/offset", title="offset"),
+        Row("align_patches", "alignment/patch_count", title="patches"),
+        Row("align_inliers", "alignment/patch_count", title="inliers"),
+        Row("align_sigma", "alignment/sigma", axes=_TWIST, title="σ"),
+        Row("align_px", "alignment/patches", _LIST, also=_STATES("patches")),
+        Row("align_residual", "alignment/patches", _LIST, also="colour of these points"),
+        Row("aligned_position_m", "alignment/position", axes=_XYZ, title="aligned"),
+        Row("point_state", "features/points", _LIST, also="shade of the points on the image"),
+        Row("residual_rms", "features/points", _LIST),
+        Row("iterations", "features/points", _LIST),
+        Row("outcome_count", "features/count", axes=_names(Feature), title="points"),
+        Row("pose_cost", "refinement/cost", _LIST, also=_TABLE),
+        Row("pose_iterations", "refinement/iterations", title="iterations"),
+        Row("pose_scale_px", "refinement/error", title="scale"),
+        Row("error_before_px", "refinement/error", title="before"),
+        Row("error_after_px", "refinement/error", title="after"),
+        Row("pose_covariance", "refinement/covariance", axes=tuple(f"{a},{b}" for a in _TWIST for b in _TWIST),
+            title="P"),
+        Row("keyframe_distance", "keyframe/distance", title="distance / depth"),
+        Row("keyframe_removed", "keyframe/removed", title="removed"),
+        Row("points_refined", "structure/refined", title="refined"),
+        Row("points_added", "structure/changed", title="added"),
+        Row("points_removed", "structure/changed", axes=("with keyframe", "not found", "outlier"), title="removed"),
+        Row("bundle_cost", "bundle/cost", _LIST, also=_TABLE),
+        Row("bundle_iterations", "bundle/iterations", title="iterations"),
+        Row("bundle_keyframes", "bundle/size", title="keyframes"),
+        Row("bundle_points", "bundle/size", title="points"),
+        Row("bundle_outliers", "bundle/size", title="outliers"),
+        Row("filters", "filters/number", title="filters"),
+        Row("filter_count", "filters/count", axes=_FILTER_OUTCOMES, title="filters"),
+        Row("filter_id", "filters/each", _LIST),
+        Row("filter_keyframe", "filters/each", _LIST),
+        Row("filter_px", "filters/each", _LIST),
+        Row("filter_mu", "filters/each", _LIST, also="`filters/shown/K/depth`"),
+        Row("filter_sigma", "filters/each", _LIST, also="`filters/shown/K/depth`"),
+        Row("filter_range", "filters/each", _LIST),
+        Row("filter_ratio", "filters/each", _LIST, also="`filters/shown/K/ratio`"),
+        Row("filter_age", "filters/each", _LIST),
+        Row("filter_outcome", "filters/each", _LIST, also="colour of the epipolar segments"),
+        Row("filter_match", "filters/each", _LIST),
+        Row("filter_inlier", "filters/each", _LIST, also="`filters/shown/K/ratio`"),
+        Row("epipolar_px", "filters/each", _LIST, also="segments `/camera/image/RUN/epipolar`"),
+        Row("filter_found_px", "filters/each", _LIST, also=_STATES("filters")),
+        *_BEGINNINGS,
+        Row("height_m", "scale/height", title="sensor", also=_TABLE),
+        Row("map_height_m", "scale/height", title="map", also=_TABLE),
+        Row("stage_ms", "work/stages", axes=_STAGES, title="time of"),
+    ),
+)  # fmt: skip
+
+BASELINE = Schema(
+    BaselineStep,
+    (
+        *VISUAL,
+        Row("prior_position_m", "prior/position", axes=_XYZ, title="prior"),
+        Row("corners", "tracking/corners", title="corners"),
+        Row("coarse_tried", "tracking/coarse", title="tried"),
+        Row("coarse_found", "tracking/coarse", title="found"),
+        Row("coarse_position_m", "tracking/coarse_position", axes=_XYZ, title="coarse"),
+        Row("score", "features/points", _LIST),
+        Row("pose_scale_px", "tracking/scale", title="scale"),
+        Row("keyframe_distance", "keyframe/distance", title="distance / depth"),
+        Row("points_added", "structure/changed", title="added"),
+        Row("points_removed", "structure/changed", title="removed"),
+        Row("bundle_keyframes", "bundle/size", axes=_BUNDLES, title="keyframes"),
+        Row("bundle_iterations", "bundle/iterations", axes=_BUNDLES, title="iterations"),
+        Row("bundle_cost", "bundle/cost", axes=("local before", "local after", "global before", "global after"),
+            title="cost"),
+        Row("bundle_outliers", "bundle/outliers", axes=_BUNDLES, title="outliers"),
+        *_BEGINNINGS,
+        Row("stage_ms", "work/stages", axes=("pyramid and corners", "tracking", "mapping"), title="time of"),
+    ),
+)  # fmt: skip
+
+CLOCKED = frozenset({"stage_ms"})
+"""Fields that the machine's clock tells: no replay repeats them."""
+
+SCHEMAS: Mapping[type[Step], Schema] = {
+    CorrelationStep: CORRELATION,
+    RangeStep: RANGE,
+    SemidirectStep: SEMIDIRECT,
+    BaselineStep: BASELINE,
+}
 
 
 def schema_of(step_type: type[Step]) -> Schema:
@@ -348,6 +544,33 @@ board, or measured ranges say; it is computed beside the estimator, which never 
 | `/world/runs/RUN/camera`, `/camera/path` | where the camera is: reference, else dead reckoned |
 | `/world/runs/RUN/landmarks/points`, `/rays`, `/ellipses` | the landmarks from above, with their intervals and 2σ |
 | `/world/runs/RUN/landmarks/surveyed` | where they are, if that is known |
+
+## Every run of visual odometry
+Entities on the image and in the world stand once a frame, those of the map where it changed. Numbers in lists
+(`Lists`) are one row a frame, as many as there are; `workbench.rrd.read_fields` gives them back as arrays. `filters/…`
+and the patches are of the semi-direct odometry. A slot of `filters/shown` follows one filter from its start to its
+end, then the next one that starts.
+
+| Entity | What |
+|---|---|
+| `/runs/RUN/ESTIMATOR/stage` | lane: starting, tracked, lost, … |
+| `/runs/RUN/ESTIMATOR/features/error` | median and 90 % quantile of the reprojection error (px of the level) |
+| `/runs/RUN/ESTIMATOR/alignment/level`, `/iterations` | cost before and after (grey²), and iterations, of each level |
+| `/runs/RUN/ESTIMATOR/filters/spread` | medians over the filters of σ/z_range and of a/(a+b) |
+| `/runs/RUN/ESTIMATOR/filters/shown/K/depth` | μ, μ ± σ (1/m) of the filter that slot K follows, 1 to 8 |
+| `/runs/RUN/ESTIMATOR/filters/shown/K/ratio`, `/number` | its a/(a+b) and C1; its number |
+| `/runs/RUN/ESTIMATOR/filters/diverged/ID/…` | the same of the first 16 filters that diverged, 300 frames back |
+| `/camera/image/RUN/features`, `/missed` | points where they were found, or expected and not found, by outcome |
+| `/camera/image/RUN/predicted` | where the map's points were expected |
+| `/camera/image/RUN/patches` | patches of the alignment in the frame before, red from a residual of 20 grey |
+| `/camera/image/RUN/epipolar`, `/filters` | segments that were searched, and what was found there, by outcome |
+| `/world/runs/RUN/camera` | the camera with its view |
+| `/world/runs/RUN/corrected`, `/path/corrected` | one point a frame; the whole path in space |
+| `/world/runs/RUN/path/reference` | the reference laid over it by Sim(3) |
+| `/world/runs/RUN/above/path`, `/body`, `/heading` | the path seen from above |
+| `/world/runs/RUN/map/points` | the map's points, green where σ is 0.1 % of the scene's depth, red at 10 % |
+| `/world/runs/RUN/map/sigma` | the same as balls of radius σ, hidden until switched on |
+| `/world/runs/RUN/map/keyframes`, `/plane` | frusta of the keyframes; z = 0, the first map's plane, as a grid |
 """
 
 

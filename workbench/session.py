@@ -33,6 +33,7 @@ from pipelines.evaluation import Evaluation, EvaluationError, Trajectory, evalua
 from pipelines.geometry import Floats, wrap_angle
 from pipelines.latency import LatencyBuffer
 from pipelines.replay import Frame, Replayed, replay
+from pipelines.semidirect.step import VisualStep
 from pipelines.verdict import Severity
 from readers.clock import StreamAudit
 from readers.streams import (
@@ -47,13 +48,14 @@ from readers.streams import (
     StreamError,
     StreamInfo,
 )
-from workbench import inputs, loss_report, manifest, range_inputs
+from workbench import inputs, loss_report, manifest, range_inputs, visual_inputs
 from workbench.checkpoints import CHECKPOINT_FRAMES, CheckpointError, CheckpointWriter
 from workbench.range_account import RangeAccount
 from workbench.range_smoothing import Smoothing
 from workbench.settings import Plugin, Resolved, SettingsError, plugin, resolve, settings_values, to_toml
 from workbench.summary import Tally, evaluation_values, lines, suitability
-from workbench.trajectory_files import tum_line_in_plane
+from workbench.trajectory_files import tum_line, tum_line_in_plane
+from workbench.visual_account import VisualAccount
 
 PACKAGES = ("estimator-workbench", "rerun-sdk", "numpy", "numba", "scipy", "opencv-python-headless", "rosbags", "mcap")
 FORMAT = 1
@@ -285,8 +287,7 @@ def _prepare(
     request: Request, recording: Recording, estimator: Plugin, resolved: Resolved, name: str, preset: str
 ) -> _Session:
     """Make every choice that can fail before anything is written."""
-    choose = _choose_for_ranges if estimator.answers == "ranges" else _choose_for_path
-    chosen = choose(request, recording, resolved)
+    chosen = _chooser(estimator)(request, recording, resolved)
     built: Any = estimator.build(chosen.resolved.settings)
     return _Session(
         request=request,
@@ -299,6 +300,14 @@ def _prepare(
         notes=[*recording.notes, *chosen.notes],
         digest=inputs.digest_of(recording, request.path),
     )
+
+
+def _chooser(estimator: Plugin) -> Callable[[Request, Recording, Resolved], _Chosen]:
+    """Who makes the choices for an estimator."""
+    if estimator.answers == "ranges":
+        return _choose_for_ranges
+    visual = estimator.step is not None and issubclass(estimator.step, VisualStep)
+    return _choose_for_visual if visual else _choose_for_path
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -320,14 +329,31 @@ class _Chosen:
     smoothing: Smoothing | None = None
 
 
-def _choose_for_path(request: Request, recording: Recording, resolved: Resolved) -> _Chosen:
-    """The choices of an estimator of the vehicle's path: images, height, scale, start."""
+class _Footage(NamedTuple):
+    """Images of a path: their stream, the window, the first one, and the reference with its offset."""
+
+    image: str
+    start_ns: int | None
+    stop_ns: int | None
+    first: inputs.FirstFrame
+    reference: inputs.Reference
+    offset_ns: int
+
+
+def _footage(request: Request, recording: Recording) -> _Footage:
+    """The images and the reference of a path."""
     image = inputs.choose_images(recording, request.image)
     start_ns, stop_ns = _window(request, recording, image)
     first = inputs.first_frame(recording, image, start_ns, stop_ns)
     offset_ns = _offset_ns(request)
     reference = inputs.load_reference(recording, request.reference, start_ns, stop_ns, offset_ns)
     reference = inputs.overlapping(recording, reference, request.reference, image, first.t_ns, offset_ns)
+    return _Footage(image, start_ns, stop_ns, first, reference, offset_ns)
+
+
+def _choose_for_path(request: Request, recording: Recording, resolved: Resolved) -> _Chosen:
+    """The choices of an estimator of the vehicle's path: images, height, scale, start."""
+    image, start_ns, stop_ns, first, reference, offset_ns = _footage(request, recording)
     if request.calibrate and not reference.poses:
         raise StreamError(f"{request.path}: --calibrate needs a reference, but there is {reference.sentence}")
     height = inputs.choose_height(recording, request.height)
@@ -346,6 +372,36 @@ def _choose_for_path(request: Request, recording: Recording, resolved: Resolved)
         account=_PathAccount(request.calibrate, resolved.settings, reference, offset_ns, scale),
         ground=reference.path.pose[:, :2] if reference.poses and scale.known else None,
         notes=notes,
+    )
+
+
+def _choose_for_visual(request: Request, recording: Recording, resolved: Resolved) -> _Chosen:
+    """The choices of a visual odometry with a map: images, camera, what tells the scale, start."""
+    if request.calibrate:
+        raise SettingsError("--calibrate is for correlation: a camera of visual odometry is calibrated with a board")
+    image, start_ns, stop_ns, first, reference, offset_ns = _footage(request, recording)
+    resolved, notes = visual_inputs.with_camera(resolved, recording, image, first.size_px)
+    resolved, source = visual_inputs.with_scale(
+        resolved,
+        recording,
+        kinds=plugin(request.estimator).build(resolved.settings).kinds,
+        height=request.height,
+        odometry=request.odometry,
+        start_ns=first.t_ns,
+    )
+    resolved = inputs.with_start(resolved, reference, first.t_ns + offset_ns)
+    account = VisualAccount(resolved.settings, reference, offset_ns, source)
+    return _Chosen(
+        frames=image,
+        others=source.streams,
+        start_ns=start_ns,
+        stop_ns=stop_ns,
+        resolved=resolved,
+        reference=reference,
+        account=account,
+        ground=reference.path.pose[:, :2] if reference.poses and source.sentence else None,
+        scene=account.scene,
+        notes=[*notes, *visual_inputs.scale_notes(source, reference)],
     )
 
 
@@ -455,7 +511,10 @@ class Account(Protocol):
         ...
 
     def conclude(self, run: RunLog, tally: Tally, median_dt_s: float, /) -> tuple[dict[str, Any], Floats | None]:
-        """What the summary says of the result; and the path [n, 2] aligned with the reference, None for none."""
+        """What the summary says of the result; and the path [n, 2] aligned with the reference, None for none.
+
+        Of a path in space: the reference [n, 3] laid over the path.
+        """
         ...
 
 
@@ -700,9 +759,8 @@ class _Session:
             run.event(step.frame, step.t_ns, Severity.ERROR, sample.reason)
         tally.add(step.verdict, step.alarms, bool(getattr(step, "accepted", True)))
         span.add(step)
-        pose = getattr(step, "pose", None)
-        if tum is not None and pose is not None:
-            tum.write(tum_line_in_plane(step.t_ns, pose))
+        if tum is not None:
+            tum.write(_trajectory_line(step))
 
     def _expected(self) -> int | None:
         """How many frames there will be, as far as the recording says it."""
@@ -933,6 +991,14 @@ def _version(package: str) -> str:
         return importlib.metadata.version(package)
     except importlib.metadata.PackageNotFoundError:
         return "not installed"
+
+
+def _trajectory_line(step: Step) -> str:
+    """The line of a step in the trajectory's file, in space where it tells that; empty where it tells no pose."""
+    if isinstance(step, VisualStep):
+        return tum_line(step.t_ns, step.position_m, step.quat_xyzw) if step.accepted else ""
+    pose = getattr(step, "pose", None)
+    return "" if pose is None else tum_line_in_plane(step.t_ns, pose)
 
 
 def _log_sample(sensors: SensorLog, step: Step, sample: ImageSample | Problem) -> None:

@@ -105,7 +105,36 @@ def _range() -> Plugin:
     return Plugin("range", RangeSettings, build, "ranges", RangeStep)
 
 
-BUILT_IN: Mapping[str, Callable[[], Plugin]] = {"correlation": _correlation, "range": _range}
+def _semidirect() -> Plugin:
+    from pipelines.semidirect.settings import SemidirectSettings
+    from pipelines.semidirect.step import SemidirectStep
+
+    def build(settings: SemidirectSettings) -> Estimator[Any]:
+        from pipelines.semidirect.odometry import SemidirectOdometry
+
+        return SemidirectOdometry(settings)
+
+    return Plugin("semidirect", SemidirectSettings, build, step=SemidirectStep)
+
+
+def _ptam() -> Plugin:
+    from pipelines.semidirect.baseline_settings import BaselineSettings
+    from pipelines.semidirect.baseline_step import BaselineStep
+
+    def build(settings: BaselineSettings) -> Estimator[Any]:
+        from pipelines.semidirect.baseline import BaselineOdometry
+
+        return BaselineOdometry(settings)
+
+    return Plugin("ptam", BaselineSettings, build, step=BaselineStep)
+
+
+BUILT_IN: Mapping[str, Callable[[], Plugin]] = {
+    "correlation": _correlation,
+    "range": _range,
+    "semidirect": _semidirect,
+    "ptam": _ptam,
+}
 
 
 def estimator_names() -> tuple[str, ...]:

@@ -58,6 +58,15 @@ ADVICE: Mapping[Verdict, str] = {
     Verdict.INPUT_MISSING: "no odometry or no rate of turn at the start",
     Verdict.INPUT_OUT_OF_ORDER: "stamps of the odometry or the IMU go backwards",
     Verdict.INPUT_UNREADABLE: "messages of the odometry or the IMU are damaged",
+    Verdict.SCALE_DRIFT: "the scale drifts, or the ground is not as high as at the start: try the preset accurate",
+    Verdict.FEW_POINTS: "the map has too few points in view: fly slower, or lower keyframe_distance or "
+    "corner_threshold",
+    Verdict.POINTS_DROPPED: "points vanish at once: blur, something before the camera, or a leap between frames",
+    Verdict.ALIGNMENT_FAILED: "the camera moves further between two frames than the alignment follows: more frames a "
+    "second, or align_coarsest higher",
+    Verdict.RELOCALISED: "found again by a keyframe that looked alike; on a surface that repeats itself that can be "
+    "another place",
+    Verdict.NEW_MAP: "a new map was begun after a loss: mend the cause of the loss",
 }
 
 CIRCUMSTANCES = Verdict.DUPLICATE_FRAME | Verdict.FRAME_GAP | Verdict.HEIGHT_CHANGE | Verdict.EXPOSURE_JUMP
@@ -143,6 +152,34 @@ def range_suitability(tally: Tally, ranging: Mapping[str, Any]) -> list[str]:
     return [f"{good}; {told}", *causes][:MOST_CAUSES]
 
 
+def visual_suitability(tally: Tally, found: Mapping[str, Any], evaluation: Evaluation | None = None) -> list[str]:
+    """Plain sentences on what the path of a visual odometry is worth: the upshot first, then the gravest causes."""
+    if not found["frames_with_pose"]:
+        return ["do not trust: no map was ever started, so that there is no path", *_causes(tally)][: 1 + MOST_CAUSES]
+    causes = _disagreement(evaluation)
+    if found["losses"]:
+        count, frames = len(found["losses"]), found["lost_frames"]
+        causes.append(f"lost {_times(count)}, for {frames} frames in all: the last pose is held there, not measured")
+    if found["relocalised"]:
+        causes.append(
+            f"found again {_times(len(found['relocalised']))} (frame {', '.join(map(str, found['relocalised'][:4]))}): "
+            "what follows hangs on one keyframe that looked alike"
+        )
+    if found["maps"] > 1:
+        causes.append(f"{found['maps']} maps: each has its own place, heading and scale")
+    causes += _causes(tally, leave=Verdict.LOST)
+    measured = found["frames_with_pose"] / tally.frames
+    good = f"{percent(measured)} of the frames have a pose of their own"
+    if measured < TRUSTED_SHARE:
+        return [f"do not trust this path: {good}", *causes[:MOST_CAUSES]]
+    told = "look at what follows" if causes else "nothing in the images speaks against the method"
+    return [f"{good}; {told}", *causes[:MOST_CAUSES]]
+
+
+def _times(count: int) -> str:
+    return "once" if count == 1 else f"{count} times"
+
+
 def _range_doubts(ranging: Mapping[str, Any]) -> list[str]:
     """What speaks against the filter's own uncertainties: NIS, and NEES where a reference is."""
     doubts = []
@@ -170,10 +207,11 @@ def _range_doubts(ranging: Mapping[str, Any]) -> list[str]:
     return doubts
 
 
-def _causes(tally: Tally) -> list[str]:
-    """The alarms that many frames have and that can be acted on, gravest first."""
+def _causes(tally: Tally, leave: Verdict = Verdict.OK) -> list[str]:
+    """The alarms that many frames have and that can be acted on, gravest first; without those told elsewhere."""
     causes = []
-    for verdict in sorted(ADVICE, key=lambda v: (v.severity, tally.alarms[v]), reverse=True):
+    told = (verdict for verdict in ADVICE if verdict not in leave)
+    for verdict in sorted(told, key=lambda v: (v.severity, tally.alarms[v]), reverse=True):
         share = tally.alarms[verdict] / tally.frames if tally.frames else 0.0
         if share >= NOTABLE_SHARE:
             causes.append(f"{percent(share)} of the frames {name_of(verdict)}: {ADVICE[verdict]}")
@@ -296,6 +334,7 @@ def lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
         rows.append(("alarms", _counts(summary["alarms"])))
     if "path_length" in summary:
         rows += [("path length", f"{summary['path_length']:.4g} {summary['unit']}"), ("scale", summary["scale"])]
+    rows += _visual_lines(summary["odometry"]) if "odometry" in summary else []
     rows += _range_lines(summary) if "ranging" in summary else _evaluation_lines(summary)
     if summary.get("calibration"):
         told = summary["calibration"]
@@ -336,6 +375,43 @@ def _evaluation_lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:
     if not math.isnan(result["yaw_drift_deg"]):
         rows.append(("yaw drift", f"{result['yaw_drift_deg']:.3g}°, {result['yaw_drift_deg_per_m']:.3g}°/m"))
     return rows + [("reference", note) for note in result["notes"]]
+
+
+def _visual_lines(found: Mapping[str, Any]) -> list[tuple[str, str]]:
+    """The start, losses, map and scale of a visual odometry, and its path in space."""
+    starts = ", ".join(map(str, found["starts"])) or "never"
+    losses = ", ".join(f"{a}" if a == b else f"{a}-{b}" for a, b in found["losses"][:MOST_CAUSES]) or "never"
+    more = ", …" if len(found["losses"]) > MOST_CAUSES else ""
+    again = ", ".join(map(str, found["relocalised"][:MOST_CAUSES])) or "never"
+    rows = [
+        ("map", f"{found['keyframes']} keyframes ({found['keyframes_made']} made), {found['map_points']} points at the "
+                f"end; started at frame {starts}; {found['maps']} in all"),
+        ("tracked", f"median {found['tracked_median']:.0f} points a frame, at least {found['tracked_least']}"
+                    if found["frames_with_pose"] else "no frame has a pose"),
+        ("lost", f"{losses}{more}; found again: {again}"),
+    ]  # fmt: skip
+    if 0 < found["frames_without_scale"] < found["frames_with_pose"]:
+        told = f"{found['frames_without_scale']} frames before the scale was known are not compared"
+        rows.append(("scale", told))
+    space = found["space"]
+    if space is None:
+        return rows
+    if "sentence" in space:
+        return [*rows, ("in space", space["sentence"])]
+    ape, attitude = space["ape_m"], space["attitude_deg"]
+    sizes = f"rmse {ape['rmse']:.4g} m ({space['ape_percent']:.3g} % of {space['reference_path_m']:.4g} m)"
+    drift = space["scale_drift_percent"]
+    drifted = "" if math.isnan(drift) else f", which changes by {drift:.3g} % from the first third to the last"
+    of_map = f"map {space['of_map']} alone: " if "of_map" in space else ""
+    rows.append(
+        ("in space", f"{of_map}{sizes}, max {ape['max']:.4g} m after Sim(3); scale {space['scale']:.5g}{drifted}")
+    )
+    if "ape_without_scale_m" in space:
+        rows.append(("in space", f"rmse {space['ape_without_scale_m']['rmse']:.4g} m after SE(3)"))
+    rows.append(
+        ("attitude", f"rmse {attitude['rmse']:.3g}°, max {attitude['max']:.3g}°, a constant mounting taken off")
+    )
+    return rows
 
 
 def _range_lines(summary: Mapping[str, Any]) -> list[tuple[str, str]]:

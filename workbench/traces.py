@@ -40,14 +40,46 @@ SEVERITY_COLOURS: Mapping[Severity, int] = {
 
 
 def columns(schema: Schema, steps: Sequence[Step]) -> dict[str, NDArray[Any]]:
-    """One array [n, *shape] per field; the steps must agree in their shapes.
+    """One array [n, *shape] per field, an array [n] of arrays per list; the steps must agree in their other shapes.
 
     Integers are int64, everything else float64, surfaces float32.
     """
     names = [row.field for row in schema.rows]
     values = zip(*map(operator.attrgetter(*names), steps), strict=True)
-    kinds = schema.kinds
-    return {name: _column(column, kinds[name]) for name, column in zip(names, values, strict=True)}
+    kinds, lists = schema.kinds, frozenset(schema.lists)
+    return {
+        name: objects(column) if name in lists else _column(column, kinds[name])
+        for name, column in zip(names, values, strict=True)
+    }
+
+
+def objects(items: Sequence[Any]) -> NDArray[Any]:
+    """An array [n] of arrays."""
+    array = np.empty(len(items), object)
+    array[:] = items
+    return array
+
+
+class Joined(NamedTuple):
+    """Lists of n steps one after another: how many belong to each step [n], and all of them [N, *shape]."""
+
+    counts: Ints
+    values: NDArray[Any]
+
+    @classmethod
+    def of(cls, lists: Iterable[NDArray[Any]]) -> Joined:
+        """Join the arrays of a list's column, one after another."""
+        arrays = list(lists)
+        return cls(np.array([len(one) for one in arrays], np.int64), np.concatenate(arrays))
+
+    @property
+    def rows(self) -> Ints:
+        """Place of the step of each of them [N]."""
+        return np.repeat(np.arange(len(self.counts)), self.counts)
+
+    def chosen(self, mask: NDArray[np.bool_]) -> Joined:
+        """Some of them."""
+        return Joined(np.bincount(self.rows[mask], minlength=len(self.counts)), self.values[mask])
 
 
 def _column(values: tuple[Any, ...], kind: Any) -> NDArray[Any]:
@@ -58,9 +90,12 @@ def _column(values: tuple[Any, ...], kind: Any) -> NDArray[Any]:
 
 def shape_of(schema: Schema) -> Any:
     """A function from a Step to the lengths that its settings decide, to tell when they change."""
-    free = [row.field for row in schema.rows if any(isinstance(n, str) for n in schema.shape(row.field))]
-    get = operator.attrgetter(*free)
-    return lambda step: tuple(array.shape for array in get(step))
+    free = [
+        row.field
+        for row in schema.rows
+        if row.archetype is not Archetype.LISTS and any(isinstance(n, str) for n in schema.shape(row.field))
+    ]
+    return lambda step: tuple(getattr(step, name).shape for name in free)
 
 
 def scalar_groups(schema: Schema, table: Columns) -> Iterator[tuple[str, Floats]]:
@@ -75,10 +110,15 @@ def _exact(kind: Any) -> Any:
     return float if kind is float else lambda value: kind(int(value))
 
 
+def _array(whole: bool) -> Any:
+    """A function from the logged numbers to an array of the declared type."""
+    return (lambda values: np.asarray(values, np.int64)) if whole else np.asarray
+
+
 def rebuild(schema: Schema, table: Mapping[str, Sequence[Any]]) -> Iterator[Step]:
     """The Steps of one sequence of values per field: the inverse of `columns`."""
     names = [row.field for row in schema.rows]
-    casts = [np.asarray if schema.shape(name) else _exact(schema.kinds[name]) for name in names]
+    casts = [_array(schema.whole(name)) if schema.shape(name) else _exact(schema.kinds[name]) for name in names]
     for values in zip(*(table[name] for name in names), strict=True):
         cast: dict[str, Any] = {name: cast(value) for name, cast, value in zip(names, casts, values, strict=True)}
         yield schema.step_type(**cast)

@@ -30,7 +30,7 @@ ORTHONORMAL = 1e-3
 # ------------------------------------------------------------------------------------ lines
 
 
-def tum_line(t_ns: int, position_m: Sequence[float], quat_xyzw: Sequence[float]) -> str:
+def tum_line(t_ns: int, position_m: Sequence[float] | Floats, quat_xyzw: Sequence[float] | Floats) -> str:
     """One line of a TUM file: time (s), x, y, z (m), quaternion x, y, z, w."""
     numbers = " ".join([repr(float(v)) for v in (*position_m, *quat_xyzw)])
     return f"{seconds_text(t_ns)} {numbers}\n"

@@ -25,7 +25,7 @@ from pipelines.verdict import Verdict, flags
 from readers.streams import RecordingError, Sample, StreamError
 from workbench import checkpoints
 from workbench.runs import Run, open_run
-from workbench.schema import Archetype, schema_of
+from workbench.schema import CLOCKED, Archetype, schema_of
 from workbench.settings import (
     Layer,
     Plugin,
@@ -44,7 +44,8 @@ Table = Mapping[str, Sequence[Any]]
 
 AGAIN = "replay the recording again"
 GIVE = "give the RUN.rrd of a replay"
-_SELDOM = ("frame", "t_ns", "received_ns", "verdict", "alarms")
+_SELDOM = frozenset({"frame", "t_ns", "received_ns", "verdict", "alarms"}) | CLOCKED
+_NUMBERS = (Archetype.SCALARS, Archetype.INTEGERS, Archetype.LISTS)
 
 
 @dataclass(frozen=True, slots=True, kw_only=True)
@@ -262,7 +263,8 @@ def _replayed(
     if old.settings != new.settings:
         if not isinstance(new, Resumable):
             raise EstimatorError(
-                f"the estimator {new.name!r} cannot go on from a state under other settings: it has no `adopted`"
+                f"the estimator {new.name!r} cannot go on from a state under other settings: it has no `adopted`; "
+                "leave out --from, so that the window begins with the first frame"
             )
         state = new.adopted(state)
     return _carried(new, state, sensors.samples(others, switch, last))[1], len(earlier)
@@ -310,7 +312,7 @@ def _read(run: Run, first: int, stop: int, step_type: type[Step]) -> Table:
     schema = schema_of(step_type)
     fields = [row.field for row in schema.rows if row.archetype is not Archetype.SURFACES]
     root = f"/runs/{run.name}/{run.about['estimator']}/"
-    entities = {root + row.entity for row in schema.rows if row.archetype in (Archetype.SCALARS, Archetype.INTEGERS)}
+    entities = {root + row.entity for row in schema.rows if row.archetype in _NUMBERS}
     with RrdParts(run.path("rrd")) as parts:
         wanted = [place for place in parts.of(entities) if place.overlaps(first, stop)]
         if not wanted:
@@ -367,6 +369,8 @@ def _size(values: Sequence[Any]) -> float:
 def _change(name: str, old: Any, new: Any, usual: float) -> Change | None:
     """The largest difference in a field, None where all its bits are equal."""
     a, b = (np.ascontiguousarray(value, np.float64) for value in (old, new))
+    if a.shape[1:] == b.shape[1:] and len(a) != len(b):
+        return Change(f"{name}: length", float(len(a)), float(len(b)), abs(len(a) - len(b)) / max(len(a), len(b)))
     if a.shape != b.shape:
         return Change(f"{name}: shape", float(a.size), float(b.size), math.inf)
     if a.tobytes() == b.tobytes():

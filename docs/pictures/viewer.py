@@ -27,6 +27,8 @@ PATIENCE_S, SETTLE_S = 120.0, 2.0
 SHOTS = {
     "demo": (("viewer.png", "best", 205, None), ("failure.png", "paper-a", 198, "Errors")),
     "range": (("range.png", "best", 24, None),),
+    "semidirect": (("semidirect.png", "fast", 270, None),),
+    "semidirect-lost": (("semidirect-lost.png", "one", 80, None),),
 }
 """By what the results are of: file, run, frame, and the tab to bring to the front."""
 

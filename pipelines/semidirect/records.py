@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 from scipy.spatial.transform import Rotation
 
-from pipelines.geometry import se3_inverse
+from pipelines.geometry import quat_of_rotation, se3_inverse
 from pipelines.semidirect.local_map import LocalMap, centre_of, centres_of
 from pipelines.semidirect.mapping import Growth
 from pipelines.semidirect.settings import SemidirectSettings
@@ -213,7 +213,7 @@ def map_fields(world: LocalMap) -> dict[str, Any]:
 
 def quat_of(cam_t_world: Floats) -> Floats:
     """The rotation from camera axes to the world as a unit quaternion x, y, z, w [4]."""
-    return np.asarray(Rotation.from_matrix(se3_inverse(cam_t_world)[:3, :3]).as_quat())
+    return quat_of_rotation(se3_inverse(cam_t_world))
 
 
 def height_over(tracked: Tracked, world: LocalMap) -> float:

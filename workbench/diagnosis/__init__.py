@@ -21,9 +21,9 @@ GRAVE_SHARE = 0.01
 
 def all_rules() -> tuple[Rule, ...]:
     """Every rule that there is."""
-    from workbench.diagnosis import path_rules, range_rules
+    from workbench.diagnosis import path_rules, range_rules, visual_rules
 
-    return (*path_rules.RULES, *range_rules.RULES)
+    return (*path_rules.RULES, *range_rules.RULES, *visual_rules.RULES)
 
 
 def rules_of(estimator: str) -> tuple[Rule, ...]:

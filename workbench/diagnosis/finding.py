@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from pipelines.estimator import Step
 from pipelines.evaluation import Trajectory, associate
 from pipelines.verdict import Severity, Verdict
+from workbench.traces import objects
 
 if TYPE_CHECKING:
     from workbench.runs import Run
@@ -85,7 +86,7 @@ class Case:
         reference: reference pose x, y, heading at each frame [n, 3], NaN where it is not known.
         harm_m: what each frame adds to the end-point error [n], NaN where it is not known.
         facts: oddities of the recording's streams, a sentence each.
-        get: the column [n, *shape] of a field by its name.
+        get: the column [n, *shape] of a field by its name, of a list an array [n] of arrays.
         reference_depth_m: of the range estimator: reference depth of the landmark in each slot [n, N], NaN where it is
             not known; None where no reference tells any.
         kept: what rules share, see `once`.
@@ -154,7 +155,9 @@ class Case:
 
         def get(name: str) -> NDArray[Any]:
             if name not in columns:
-                columns[name] = np.array([getattr(step, name) for step in steps])
+                values = [getattr(step, name) for step in steps]
+                alike = len({np.shape(value) for value in values}) <= 1
+                columns[name] = np.array(values) if alike else objects(values)
             return columns[name]
 
         return cls(

@@ -182,6 +182,8 @@ def errors(run: Run) -> list[Chart]:
 
 def own(run: Run) -> list[Chart]:
     """What the estimator itself says of its work."""
+    if run.visual:
+        return _visual(run)
     return {"correlation": _correlation, "range": _range}.get(run.estimator, _nothing)(run)
 
 
@@ -215,6 +217,42 @@ def _correlation(run: Run) -> list[Chart]:
         chart("inliers", "Fragments that agree", "1", "How many fragments and tiles fit one rigid motion.",
               Curve("inliers", inliers.astype(np.float64)), *bound("min_inliers")),
     ]  # fmt: skip
+
+
+def _visual(run: Run) -> list[Chart]:
+    frames, t_s = run.frames, seconds(run)
+
+    def chart(key: str, title: str, unit: str, about: str, *curves: Curve, from_zero: bool = False) -> Chart:
+        return Chart(key, title, unit, about, frames, t_s, curves, from_zero)
+
+    def curve(name: str, field: str) -> Curve:
+        return Curve(name, run.column(field).astype(np.float64))
+
+    def bound(setting: str) -> tuple[Curve, ...]:
+        value = run.settings.get(setting)
+        return () if value is None else (Curve(f"bound {setting}", np.full(len(frames), float(value)), "bound"),)
+
+    charts = [
+        chart("tracked", "Points that agree with the pose", "1", "Below the bound the camera is lost.",
+              curve("points", "tracked"), *bound("min_tracked"), from_zero=True),
+        chart("map", "Points in the map", "1", "What the camera can be found by.", curve("points", "map_points"),
+              from_zero=True),
+        chart("keyframe-distance", "Distance to the nearest keyframe over the scene's depth", "1",
+              "Above the bound the frame becomes a keyframe.", curve("distance", "keyframe_distance"),
+              *bound("keyframe_distance")),
+    ]  # fmt: skip
+    if "error_after_px" in run.fields:
+        charts.insert(1, chart("reprojection", "Reprojection error", "px", "Median, before and after the refinement.",
+                               curve("before", "error_before_px"), curve("after", "error_after_px")))  # fmt: skip
+        charts.append(chart("alignment", "Residual of the alignment", "grey²", "Mean square, at the finest level.",
+                            curve("residual", "align_final_cost")))  # fmt: skip
+        charts.append(chart("filters", "Depth filters at work", "1", "Corners whose depth is not sure yet.",
+                            curve("filters", "filters"), from_zero=True))  # fmt: skip
+    if "height_m" in run.fields and np.isfinite(run.column("height_m")).any():
+        charts.append(chart("height", "Height", "m", "Where both part, the scale has drifted or the ground changed.",
+                            curve("over the map", "map_height_m"),
+                            Curve("sensor", run.column("height_m").astype(np.float64), "reference")))  # fmt: skip
+    return charts
 
 
 def _over(statistic: Any, values: Floats) -> Floats:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from pipelines.ranging.filter import Outcome, Status
 from readers.streams import RecordingError, StreamError
 from workbench import traces
+from workbench.report import visual_pictures
 from workbench.report.markup import Element, el
 from workbench.runs import Run
 from workbench.schema import Archetype
@@ -85,6 +86,9 @@ def pictures(run: Run, frames: Iterable[int]) -> dict[int, Picture]:
     if run.estimator == "correlation":
         stored = _stored_surfaces(run, wanted)
         return {frame: _correlation(run, frame, images[frame], stored.get(frame)) for frame in wanted}
+    if run.visual:
+        lists = visual_pictures.lists_of(run, wanted)
+        return {frame: _visual(run, frame, images[frame], lists[frame]) for frame in wanted}
     drawn = _drawn(run, wanted)
     return {frame: _drawn_picture(run, frame, images[frame], drawn) for frame in wanted}
 
@@ -301,6 +305,20 @@ def _heat(values: Floats) -> NDArray[np.uint8]:
     heat = np.asarray(cv2.applyColorMap(grey, cv2.COLORMAP_VIRIDIS), np.uint8)
     heat[~np.isfinite(values)] = 96
     return heat
+
+
+# -------------------------------------------------------------------------------- visual odometry
+
+
+def _visual(run: Run, frame: int, grey: Grey | str, here: Mapping[str, NDArray[Any]]) -> Picture:
+    row = run.row_of(frame)
+    told = visual_pictures.caption(frame, int(run.column("stage")[row]), here) + _excuse(grey)
+    width, height = run.column("image_size_px")[row].tolist()
+    label = f"image of frame {frame} with the points of the map"
+    content = (_blank(0, 0, width, height), _shown(grey), visual_pictures.marks(here))
+    image = _svg((0, 0, width, height), label, *content) if width > 0 and height > 0 else None
+    heads, rows = visual_pictures.table(here)
+    return Picture(frame, image, told, None, "", heads, rows)
 
 
 # -------------------------------------------------------------------------------- what a replay drew
