@@ -224,15 +224,11 @@ def test_mapping_beside_hands_on_errors_and_adjustments():
     class Growing:
         """A mapper whose keyframes are moved by the bundle."""
 
-        def __init__(self):
-            self.done = threading.Event()
-
         def grown(self, world, posed):
             if posed.number == 99:
                 raise ValueError("broken on purpose")
             moved = posed.cam_t_world @ se3_exp(np.array([0.1, 0, 0, 0, 0, 0]))
             nothing = dict.fromkeys(mapping.Growth._fields)
-            self.done.set()
             return mapping.Growth(**nothing | {"world": world, "keyframe": True, "cam_t_world": moved})
 
     def posed(number):
@@ -250,15 +246,18 @@ def test_mapping_beside_hands_on_errors_and_adjustments():
     beside = Beside(mapper)
     beside.begin(world)
     beside.post(posed(50))
-    until(lambda: bool(beside._shift))
-    found, shift = beside.newest(since=60)
-    assert found is world
-    assert np.allclose(shift, se3_exp(np.array([0.1, 0, 0, 0, 0, 0])))
-    assert np.allclose(beside.newest(since=60)[1], np.eye(4))  # told once
+    until(lambda: bool(beside._grown))
+    found = beside.newest()
+    assert found.world is world
+    assert [growth.keyframe for growth in found.growths] == [True]
+    assert np.allclose(found.shift, se3_exp(np.array([0.1, 0, 0, 0, 0, 0])))
+    again = beside.newest()
+    assert np.allclose(again.shift, np.eye(4))  # told once
+    assert again.growths == ()
     beside.post(posed(99))
     until(lambda: beside._failed is not None)
     with pytest.raises(ValueError, match="on purpose"):
-        beside.newest(since=99)
+        beside.newest()
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.2])

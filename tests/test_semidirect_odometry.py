@@ -364,3 +364,6 @@ def test_mapping_beside_tracking_flies_the_same_way():
     assert sum(s.stage == Stage.LOST for s in steps) == 0
     assert flights.path_error(steps)[0] < 5e-3
     assert steps[-1].map_points > steps[20].map_points
+    assert sum(s.keyframe for s in steps) > 3
+    assert sum(len(s.map_id) > 0 for s in steps) > 3
+    assert sum(s.points_added for s in steps) > 100

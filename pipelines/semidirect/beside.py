@@ -2,25 +2,35 @@
 
 The thread takes posed frames one after the other and publishes a new map after each. When it falls behind, only the
 newest frames that wait are kept: a depth filter that misses a frame loses nothing but that measurement. What a frame
-meets in the map depends on the thread's timing, so that a replay differs from time to time.
+meets in the map depends on the thread's timing, so that a replay differs from time to time; and what the mapping did
+with a frame is told with a later one.
 """
 
 from __future__ import annotations
 
 import threading
 from collections import deque
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
 from pipelines.geometry import se3_inverse, se3_product
 from pipelines.semidirect.local_map import LocalMap
-from pipelines.semidirect.mapping import Mapper, Posed
+from pipelines.semidirect.mapping import Growth, Mapper, Posed
 
 Floats = NDArray[np.float64]
 
 WAITING = 4
 """Frames that may wait for the mapping."""
+
+
+class Newest(NamedTuple):
+    """A map; how adjustments moved poses [4, 4] that were found in the map before, T ← T shift; what was done."""
+
+    world: LocalMap
+    shift: Floats
+    growths: tuple[Growth, ...]
 
 
 class Beside:
@@ -36,7 +46,9 @@ class Beside:
         self._change = threading.Condition()
         self._world: LocalMap | None = None
         self._epoch = 0
-        self._shift: list[tuple[int, Floats]] = []
+        self._grown: list[tuple[Posed, Growth]] = []
+        self.dropped = 0
+        """Frames that the mapping had no time for."""
         self._failed: Exception | None = None
         threading.Thread(target=self._work, name="mapping", daemon=True).start()
 
@@ -45,16 +57,17 @@ class Beside:
         with self._change:
             self._world, self._epoch = world, self._epoch + 1
             self._waiting.clear()
-            self._shift.clear()
+            self._grown.clear()
 
     def post(self, posed: Posed) -> None:
         """Give a frame to the thread."""
         with self._change:
+            self.dropped += len(self._waiting) == WAITING
             self._waiting.append(posed)
             self._change.notify()
 
-    def newest(self, *, since: int) -> tuple[LocalMap, Floats]:
-        """The newest map, and how adjustments moved the poses [4, 4] of frames up to number `since`: T ← T shift.
+    def newest(self) -> Newest:
+        """The newest map, and what was done to it since this was asked before.
 
         Raises:
             Exception: what the mapping raised.
@@ -63,12 +76,13 @@ class Beside:
             if self._failed is not None:
                 raise self._failed
             assert self._world is not None
-            shift = np.eye(4)
-            for number, by in self._shift:
-                if number <= since:
+            shift, growths = np.eye(4), tuple(growth for _, growth in self._grown)
+            for posed, growth in self._grown:
+                if growth.keyframe:
+                    by = se3_product(se3_inverse(posed.cam_t_world), growth.cam_t_world)
                     shift = se3_product(shift, by)
-            self._shift.clear()
-            return self._world, shift
+            self._grown.clear()
+            return Newest(self._world, shift, growths)
 
     def _work(self) -> None:
         while True:
@@ -85,6 +99,4 @@ class Beside:
             with self._change:
                 if epoch == self._epoch:
                     self._world = growth.world
-                    if growth.keyframe:
-                        by = se3_product(se3_inverse(posed.cam_t_world), growth.cam_t_world)
-                        self._shift.append((posed.number, by))
+                    self._grown.append((posed, growth))

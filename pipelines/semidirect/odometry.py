@@ -373,7 +373,7 @@ class SemidirectOdometry:
     def _followed(self, state: SemidirectState, sample: ImageSample, pyramid: Pyramid, clock: _Stopwatch) -> Met:
         """Track a frame by the last one."""
         assert self._tracker is not None
-        state = self._caught_up(state)
+        state, grown = self._caught_up(state)
         assert state.world is not None
         assert state.last is not None
         dt_s = (sample.t_ns - state.last.t_ns) * 1e-9
@@ -386,7 +386,7 @@ class SemidirectOdometry:
             again = self._tracker.track(state.world, state.last, pyramid, STILL, clock.lap)
             if again.points > tracked.points:
                 tracked, alarms = again, self._doubts(state, again)
-        fields = track_fields(tracked, state.world)
+        fields = grown | track_fields(tracked, state.world)
         if alarms:
             return Met(replace(state, lost_ns=sample.t_ns), Stage.LOST, alarms | Verdict.LOST, fields)
         return self._accepted(state, sample, pyramid, tracked, Stage.TRACKED, Verdict.OK, fields, clock)
@@ -455,13 +455,17 @@ class SemidirectOdometry:
         new = self._scaled(new, sample.t_ns)
         return Met(new, stage, alarms | self._scale_alarms(new, fields), fields | {"accepted": True})
 
-    def _caught_up(self, state: SemidirectState) -> SemidirectState:
-        """The state with the newest map of the thread beside, if there is one."""
+    def _caught_up(self, state: SemidirectState) -> tuple[SemidirectState, dict[str, Any]]:
+        """The state with the newest map of the thread beside, if there is one; and what it did, for the log."""
         if self._beside is None or state.last is None:
-            return state
-        world, shift = self._beside.newest(since=state.last.number)
-        pose = se3_product(state.last.cam_t_world, shift)
-        return replace(state, world=world, last=state.last._replace(cam_t_world=pose), held=pose)
+            return state, {}
+        newest = self._beside.newest()
+        pose = se3_product(state.last.cam_t_world, newest.shift)
+        now = replace(state, world=newest.world, last=state.last._replace(cam_t_world=pose), held=pose)
+        keyframes = [growth for growth in newest.growths if growth.keyframe]
+        if not newest.growths:
+            return now, {}
+        return now, growth_fields((keyframes or newest.growths)[-1]) | (map_fields(newest.world) if keyframes else {})
 
     def _known(
         self, number: int, t_ns: int, pyramid: Pyramid, pose: Floats, sighted: Tracked, world: LocalMap
@@ -514,12 +518,12 @@ class SemidirectOdometry:
     def _searched(self, state: SemidirectState, sample: ImageSample, pyramid: Pyramid, clock: _Stopwatch) -> Met:
         """Look for a lost camera by the keyframes; begin a new map when that has failed for long."""
         assert self._tracker is not None
-        s, state = self._settings, self._caught_up(state)
+        s, (state, grown) = self._settings, self._caught_up(state)
         assert state.world is not None
         assert state.last is not None
         found = relocalised(self._tracker, state.world, pyramid, state.last.cam_t_world, s.relocalise_correlation)
         clock.lap(3)
-        fields = _search_fields(found, state.world)
+        fields = grown | _search_fields(found, state.world)
         if found.tracked is not None and _convincing(found.tracked, s):
             new = replace(state, relocalised_frames=0)
             return self._accepted(
