@@ -4,6 +4,7 @@ import dataclasses
 import itertools
 import math
 
+import cv2
 import numpy as np
 import pytest
 import semidirect_flights as flights
@@ -224,6 +225,17 @@ def test_frames_that_cannot_be_used_are_passed_over():
         Verdict.FRAME_GAP
         in flights.flown(SemidirectOdometry(flights.settings()), [*pictures[:30], *pictures[35:]])[0][30].alarms
     )
+
+
+def test_blurred_and_brighter_frames_are_told():
+    pictures = flights.pictures(FRAMES)[:50].copy()
+    pictures[40] = cv2.GaussianBlur(pictures[40], (0, 0), 4)
+    pictures[45] = np.clip(pictures[45].astype(int) + 30, 0, 255).astype(np.uint8)
+    steps, _ = flights.flown(SemidirectOdometry(flights.settings()), samples(pictures))
+    assert [s.frame for s in steps if Verdict.BLURRED in s.alarms] == [40]
+    assert steps[40].sharpness < 0.5 * steps[39].sharpness
+    assert [s.frame for s in steps if Verdict.EXPOSURE_JUMP in s.alarms] == [45, 46]
+    assert steps[45].mean_grey == pytest.approx(steps[44].mean_grey + 27, abs=6)
 
 
 def test_settings_that_cannot_be():

@@ -382,6 +382,8 @@ SEMIDIRECT = Schema(
     SemidirectStep,
     (
         *VISUAL,
+        Row("mean_grey", "image/grey", title="mean grey"),
+        Row("sharpness", "image/sharpness", title="sharpness"),
         Row("prior_position_m", "prior/position", axes=_XYZ, title="prior"),
         Row("prior_quat_xyzw", "prior/rotation", axes=_QUAT, title="prior"),
         Row("align_cost", "alignment/cost", _LIST, also="`alignment/level`: before and after, of each level"),

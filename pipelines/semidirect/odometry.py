@@ -51,6 +51,10 @@ Floats = NDArray[np.float64]
 
 USUAL_FRAMES = 31
 """Frames of the running median of the time between frames."""
+SHARP_FRAMES = 9
+"""Frames of the running median of the sharpness: so few that the ground is still the same."""
+SHARP_ROWS = 16
+"""Every sixteenth row tells the sharpness."""
 STILL = np.eye(4)
 MISSED = (Feature.NOT_CONVERGED, Feature.FLAT, Feature.LEFT_IMAGE, Feature.OUTLIER)
 """What counts against a point: it was in view and not found, or found elsewhere."""
@@ -90,6 +94,7 @@ class SemidirectState:
     watch: ScaleWatch = ScaleWatch()
     height_m: float = math.nan
     mean_grey: float = math.nan
+    sharpness: tuple[float, ...] = ()
     intervals_s: tuple[float, ...] = ()
     camera: tuple[Any, ...] = ()
 
@@ -240,7 +245,8 @@ class SemidirectOdometry:
             met = self._searched(state, sample, pyramid, clock)
         else:
             met = self._followed(state, sample, pyramid, clock)
-        return met._replace(alarms=met.alarms | alarms, fields=met.fields | {"stage_ms": clock.ms})
+        seen = {"mean_grey": state.mean_grey, "sharpness": state.sharpness[-1], "stage_ms": clock.ms}
+        return met._replace(alarms=met.alarms | alarms, fields=met.fields | seen)
 
     def _for_size(self, height: int, width: int) -> None:
         """Build the tracker and the mapper for images of that size."""
@@ -276,8 +282,12 @@ class SemidirectOdometry:
             if intervals and dt_s > s.gap_factor * float(np.median(intervals)):
                 alarms |= Verdict.FRAME_GAP
             intervals = (*intervals[1 - USUAL_FRAMES :], dt_s)
+        sharpness = sharpness_of(level_image(pyramid, 0), mean_grey)
+        if state.sharpness and sharpness < s.min_sharpness_ratio * float(np.median(state.sharpness)):
+            alarms |= Verdict.BLURRED
+        latest = (*state.sharpness[1 - SHARP_FRAMES :], sharpness)
         size = (pyramid.height, pyramid.width)
-        return alarms, replace(state, mean_grey=mean_grey, intervals_s=intervals, size=size)
+        return alarms, replace(state, mean_grey=mean_grey, sharpness=latest, intervals_s=intervals, size=size)
 
     def _skipped(self, state: SemidirectState, verdict: Verdict) -> Met:
         """Pass over a frame that cannot be used; the next one is compared with the frame before it."""
@@ -611,6 +621,16 @@ class _Stopwatch:
             now = time.thread_time()
             self.ms[stage] += (now - self._since) * 1e3
             self._since = now
+
+
+def sharpness_of(image: Grey, mean_grey: float) -> float:
+    """Mean squared difference of neighbours along some of the rows, over the squared mean grey level.
+
+    Over that, a longer exposure does not pass for a sharper image.
+    """
+    rows = image[::SHARP_ROWS].astype(np.int32)
+    step = np.diff(rows, axis=1).ravel()
+    return float(step @ step) / step.size / max(mean_grey, 1.0) ** 2
 
 
 def _number(state: SemidirectState, sample: ImageSample | Problem) -> int:

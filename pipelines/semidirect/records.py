@@ -30,6 +30,8 @@ def blank_fields(s: SemidirectSettings) -> dict[str, Any]:
     return {
         "accepted": False,
         "stage": int(Stage.SKIPPED),
+        "mean_grey": np.nan,
+        "sharpness": np.nan,
         "pose_sigma": _NAN6,
         "tracked": 0,
         "keyframe": 0,

@@ -141,6 +141,7 @@ class SemidirectSettings(CameraSettings):
     # verdicts
     max_level_change: Positive = Field(8.0, description="EXPOSURE_JUMP above, change of the mean grey level")
     gap_factor: Positive = Field(1.6, description="FRAME_GAP above this multiple of the running median of dt")
+    min_sharpness_ratio: Fraction = Field(0.5, description="BLURRED below this share of the last frames' median")
     max_height_ratio: Positive = Field(0.1, description="SCALE_DRIFT above, map's height against the sensor's")
 
     # how it runs

@@ -116,6 +116,10 @@ class VisualStep(Step):
 class SemidirectStep(VisualStep):
     """One frame of the semi-direct odometry."""
 
+    # 0. the image
+    mean_grey: float = quantity("grey", "mean grey level of the coarsest level")
+    sharpness: float = quantity("1", "mean squared step along the rows over the squared mean grey level")
+
     # 1. prior, sparse image alignment
     prior_position_m: Floats = quantity("m", "the camera's centre before any image was looked at", 3)
     prior_quat_xyzw: Floats = quantity("1", "its rotation to the world", 4)
