@@ -1,5 +1,6 @@
 """Short flights over a smooth plane: what the semi-direct odometry is tested on."""
 
+import dataclasses
 import functools
 from collections.abc import Iterable
 
@@ -27,6 +28,13 @@ CAMERA = Camera(
     rectification=np.eye(3),
     projection=np.zeros((3, 4)),
 )
+
+
+LENSES = {
+    "none": ("none", ()),
+    "radial-tangential": ("plumb_bob", (-0.28, 0.07, 0.0002, -0.0001, 0.0)),
+    "equidistant": ("equidistant", (-0.01, 0.004, 0.0, 0.0)),
+}
 
 
 def settings(**changes):
@@ -57,19 +65,21 @@ def ground():
 
 
 @functools.cache
-def sight_lines():
+def sight_lines(through="none"):
     """Directions of the pixels in camera axes [rows * cols, 3]."""
+    model, coefficients = LENSES[through]
+    camera = dataclasses.replace(CAMERA, distortion_model=model, distortion=np.array(coefficients))
     v, u = np.mgrid[:HEIGHT, :WIDTH]
-    return lens.rays(CAMERA, np.column_stack([u.ravel(), v.ravel()]).astype(float))
+    return lens.rays(camera, np.column_stack([u.ravel(), v.ravel()]).astype(float))
 
 
 @functools.cache
-def pictures(frames=90, noise=1.0):
+def pictures(frames=90, noise=1.0, through="none"):
     """What the camera sees on its way, uint8 [frames, rows, cols], with noise of so many grey levels."""
     rng = np.random.default_rng(5)
     found = []
     for centre, turn in zip(*way(frames), strict=True):
-        lines = sight_lines() @ turn.T
+        lines = sight_lines(through) @ turn.T
         east, north = (centre[:2] - lines[:, :2] * (centre[2] / lines[:, 2:])).T.reshape(2, HEIGHT, WIDTH)
         at = ((east - WEST_M) / GROUND_M).astype(np.float32), ((NORTH_M - north) / GROUND_M).astype(np.float32)
         clean = cv2.remap(ground(), *at, cv2.INTER_CUBIC)

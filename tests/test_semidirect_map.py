@@ -18,6 +18,8 @@ from pipelines.semidirect.mapping import Mapper, Posed
 from pipelines.semidirect.optics import optics_of
 from pipelines.semidirect.pyramid import Pyramid, pyramid_of
 from pipelines.semidirect.refinement import Observations
+from pipelines.semidirect.scale import Plane
+from pipelines.semidirect.starting import standing, unit_of
 from pipelines.semidirect.step import Feature, Stage
 from pipelines.semidirect.tracking import Tracker
 
@@ -293,9 +295,15 @@ def local_level(pyramid, level):
     return level_image(pyramid, level)
 
 
-def test_the_world_of_a_start_stands_on_the_plane():
-    from pipelines.semidirect.starting import standing
+@pytest.mark.parametrize(("direction", "height"), [("vertical", 1.5), ("axis", 1.5 / np.cos(0.4))])
+def test_heights_along_the_axis_are_longer_than_over_the_ground(direction, height):
+    normal = np.array([np.sin(0.4), 0.0, np.cos(0.4)])
+    plane = Plane(normal, 0.75, 0.001, 0.001, 100)  # 0.75 units over the ground are 1.5 m
+    assert unit_of(plane, height, direction) == pytest.approx(2.0)
+    assert unit_of(plane, np.nan, direction) == 1.0
 
+
+def test_the_world_of_a_start_stands_on_the_plane():
     normal = np.array([0.1, -0.05, 1.0]) / np.linalg.norm([0.1, -0.05, 1.0])
     pose = standing(normal, 2.0, (3.0, -4.0), 0.6)
     world_t_cam = se3_inverse(pose)

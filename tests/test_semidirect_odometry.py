@@ -38,6 +38,18 @@ def test_path_is_the_true_one(changes):
     assert abs(scale - 1) < 0.02  # the height gives it
 
 
+@pytest.mark.parametrize("through", ["radial-tangential", "equidistant"])
+def test_path_through_a_lens_that_bends(through):
+    model, coefficients = flights.LENSES[through]
+    told = {"distortion_model": model, "distortion": coefficients}
+    bent = samples(flights.pictures(50, through=through))
+    steps, _ = flights.flown(SemidirectOdometry(flights.settings(**told)), bent)
+    assert flights.path_error(steps, 50)[0] < 1.5e-3
+    assert not any(s.stage == Stage.LOST for s in steps)
+    wrong, _ = flights.flown(SemidirectOdometry(flights.settings()), bent)
+    assert flights.path_error(wrong, 50)[0] > 2 * flights.path_error(steps, 50)[0]  # the lens is told for a reason
+
+
 def test_positions_are_those_of_the_world():
     # the world's plane is the ground, so that without any alignment heights are right
     steps = flights.flight(FRAMES)

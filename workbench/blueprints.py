@@ -414,6 +414,7 @@ _SEMIDIRECT_PLOTS: Mapping[str, Sequence[tuple[str, str]]] = {
         ("Filters at work", "filters/number"),
         ("Median σ/z_range and a/(a+b)", "filters/spread"),
     ),
+    "Image": (("Mean grey level", "image/grey"), ("Sharpness", "image/sharpness")),
     "Height": (("Height: sensor, and over the map, m", "scale/height"),),
     "Times": (("Time of the stages, ms", "work/stages"),),
 }

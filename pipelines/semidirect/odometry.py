@@ -341,7 +341,8 @@ class SemidirectOdometry:
             pyramid,
             found,
             known,
-            metres=state.height_m,
+            height_m=state.height_m,
+            height_direction=s.height_direction,
             place=place,
             heading_rad=heading + s.mounting_yaw_rad,
             next_number=0 if state.world is None else state.world.next_number,
@@ -519,7 +520,10 @@ class SemidirectOdometry:
     def _scale_alarms(self, state: SemidirectState, fields: dict[str, Any]) -> Verdict:
         if not state.scale.known:
             return Verdict.SCALE_UNKNOWN
-        height = fields.get("map_height_m", math.nan) / state.height_m
+        expected = state.height_m
+        if self._settings.height_direction == "axis" and state.held is not None:
+            expected *= -state.held[2, 2]  # the axis seen from above: cosine of the tilt
+        height = fields.get("map_height_m", math.nan) / expected
         drifted = bool(self._settings.height_stream) and abs(height - 1) > self._settings.max_height_ratio
         return Verdict.SCALE_DRIFT if drifted else Verdict.OK
 

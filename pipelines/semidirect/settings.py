@@ -35,6 +35,9 @@ class CameraSettings(BaseModel):
     height_m: Positive | None = Field(None, description="camera height over the ground at the start, m: the scale")
     height_stream: str = Field("", description="stream with the camera height: range, number, or z of a pose")
     height_offset_m: float = Field(0.0, description="added to every value of the height stream, m")
+    height_direction: Literal["vertical", "axis"] = Field(
+        "vertical", description="heights are over the ground, or distances along the camera's axis"
+    )
     height_sigma_m: Positive = Field(0.02, description="standard deviation of a height, m")
     speed_stream: str = Field("", description="stream of odometry whose speed gives the scale, where no height does")
     speed_sigma_mps: Positive = Field(0.05, description="standard deviation of such a speed, m/s")
@@ -88,7 +91,9 @@ class SemidirectSettings(CameraSettings):
     start_motion_px: Positive = Field(50.0, description="median way of the corners that allows a start")
     start_parallax_px: Positive = Field(10.0, description="median way beyond all rotation that allows a start")
     start_min_inliers: Count = Field(40, description="fewer points are no first map")
-    start_model: Literal["auto", "plane", "space"] = Field("auto", description="homography, essential matrix, or both")
+    start_model: Literal["plane", "space", "auto"] = Field(
+        "plane", description="homography (ground), essential matrix (a camera that looks ahead), or what fits better"
+    )
 
     # sparse image alignment
     prior: Literal["constant-velocity", "still"] = Field("constant-velocity", description="motion that it starts from")

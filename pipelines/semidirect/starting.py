@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+import math
+from typing import Literal, NamedTuple
 
 import cv2
 import numpy as np
@@ -19,7 +20,7 @@ from pipelines.semidirect.local_map import (
 )
 from pipelines.semidirect.optics import Optics, rays
 from pipelines.semidirect.pyramid import Grey, Pyramid, level_image
-from pipelines.semidirect.scale import plane_of
+from pipelines.semidirect.scale import Plane, plane_of
 from pipelines.semidirect.settings import SemidirectSettings
 from pipelines.semidirect.start import Model, Start, StartLimits, start
 
@@ -109,7 +110,8 @@ def first_map(
     found: Start,
     known: Flags,
     *,
-    metres: float,
+    height_m: float,
+    height_direction: Literal["vertical", "axis"],
     place: tuple[float, float],
     heading_rad: float,
     next_number: int,
@@ -122,7 +124,8 @@ def first_map(
         pyramid: of the second view.
         found: what `begun` told.
         known: likewise.
-        metres: height of the first camera over the plane, NaN to leave the median depth at 1.
+        height_m: height of the first camera over the plane, NaN to leave the median depth at 1.
+        height_direction: whether that is over the ground or along the camera's axis.
         place: x, y of the first camera.
         heading_rad: of its u axis.
         next_number: of the first point.
@@ -130,7 +133,7 @@ def first_map(
     which, inlier = following.which[known][found.inlier], found.inlier
     points = found.points[inlier]
     plane = plane_of(points)
-    unit = metres / plane.distance if metres == metres else 1.0
+    unit = unit_of(plane, height_m, height_direction)
     first_t_world = standing(plane.normal, plane.distance * unit, place, heading_rad)
     second_t_first = np.eye(4)
     second_t_first[:3, :3], second_t_first[:3, 3] = found.rotation, found.translation * unit
@@ -153,6 +156,17 @@ def first_map(
     table = table._replace(stale=np.ones(n, np.int64))
     world = LocalMap(keyframes, table, seen, no_filters(), next_number + n)
     return FirstMap(world, float(np.median(points[:, 2])) * unit, unit)
+
+
+def unit_of(plane: Plane, height_m: float, direction: Literal["vertical", "axis"]) -> float:
+    """Metres of a unit in which a camera sees a plane n·x = d; 1 for an unknown height.
+
+    The camera is d over the plane, and d/n_z from it along its axis.
+    """
+    if math.isnan(height_m):
+        return 1.0
+    away = plane.distance if direction == "vertical" else plane.distance / plane.normal[2]
+    return float(height_m / away)
 
 
 def standing(normal: Floats, height: float, place: tuple[float, float], heading_rad: float) -> Floats:
