@@ -638,7 +638,9 @@ def test_the_demo_replays_both_presets(toys: Path, shell: Shell, monkeypatch: py
     assert said.out.endswith("workbench view results/demo\n")
     assert Path("results/demo/best.rrd").is_file()
     assert Path("results/demo/paper-a.rrd").is_file()
-    assert set(shell("demo", "--json").json["runs"]) == {"best", "paper-a"}
+    runs = shell("demo", "--json").json["runs"]
+    assert set(runs) == {"best", "paper-a"}
+    assert all({"findings", "not_judged"} <= set(run) for run in runs.values())
 
 
 # ---------------------------------------------------------------------------------- digest

@@ -534,11 +534,17 @@ def _conclude(outcome: Outcome, as_json: bool) -> NoReturn:
     """Print what became of a replay and leave with its exit status."""
     findings, refused = _findings_of(outcome)
     if as_json:
-        told = {"findings": [cli_runs.finding_values(finding) for finding in findings], "not_judged": refused}
-        print_json(outcome.summary | told | {"folder": str(outcome.folder), "files": _files(outcome)})
+        print_json(
+            outcome.summary | _told(findings, refused) | {"folder": str(outcome.folder), "files": _files(outcome)}
+        )
     else:
         _print_summary(outcome, findings, refused)
     raise typer.Exit(_status(outcome))
+
+
+def _told(findings: Sequence[Finding], refused: str) -> dict[str, Any]:
+    """Findings, or why there are none, for JSON."""
+    return {"findings": [cli_runs.finding_values(finding) for finding in findings], "not_judged": refused}
 
 
 def _findings_of(outcome: Outcome) -> tuple[Sequence[Finding], str]:
@@ -937,21 +943,22 @@ def demo(
     ),
     as_json: AsJson = False,
 ) -> None:
-    """Replay the built-in recording with both presets and say how to look at the result."""
+    """Replay the built-in recording with both presets: what went wrong in it, and how to look at the result."""
     from workbench.session import Request
 
     path = demo_recording()
-    outcomes = []
+    runs = {}
     for preset in ("best", "paper-a"):
         outcome = _replay(Request(path=path, preset=preset, out=out))
-        outcomes.append(outcome)
+        findings, refused = _findings_of(outcome)
+        runs[outcome.summary["run"]] = outcome.summary | _told(findings, refused)
         if not as_json:
-            _print_summary(outcome)
+            _print_summary(outcome, findings, refused)
             print()
         if status := _status(outcome):
             raise typer.Exit(status)
     if as_json:
-        print_json({"folder": str(out), "runs": {o.summary["run"]: o.summary for o in outcomes}})
+        print_json({"folder": str(out), "runs": runs})
         return
     print(f"Both runs lie in {out}. Look at them, one over the other, with:\n  workbench view {out}")
 
