@@ -44,10 +44,13 @@ def settings(**changes):
 
 
 @functools.cache
-def way(frames=90):
-    """Centres [n, 3] and rotations camera to world [n, 3, 3] of a flight at 1.5 m that sways and turns."""
+def way(frames=90, climb=0.0):
+    """Centres [n, 3] and rotations camera to world [n, 3, 3] of a flight at 1.5 m that sways and turns.
+
+    It may climb, m/s.
+    """
     t = np.arange(frames) / 60.0
-    centres = np.column_stack([1.6 * t, 0.15 * np.sin(2.5 * t), 1.5 + 0.05 * np.sin(1.7 * t)])
+    centres = np.column_stack([1.6 * t, 0.15 * np.sin(2.5 * t), 1.5 + 0.05 * np.sin(1.7 * t) + climb * t])
     angles = np.column_stack([0.25 * np.sin(1.1 * t), 0.03 * np.sin(4 * t), 0.03 * np.sin(3.1 * t + 1)])
     angles -= angles[0] * (0, 1, 1)
     return centres, Rotation.from_euler("ZYX", angles).as_matrix() @ DOWN
@@ -74,11 +77,11 @@ def sight_lines(through="none"):
 
 
 @functools.cache
-def pictures(frames=90, noise=1.0, through="none"):
+def pictures(frames=90, noise=1.0, through="none", climb=0.0):
     """What the camera sees on its way, uint8 [frames, rows, cols], with noise of so many grey levels."""
     rng = np.random.default_rng(5)
     found = []
-    for centre, turn in zip(*way(frames), strict=True):
+    for centre, turn in zip(*way(frames, climb), strict=True):
         lines = sight_lines(through) @ turn.T
         east, north = (centre[:2] - lines[:, :2] * (centre[2] / lines[:, 2:])).T.reshape(2, HEIGHT, WIDTH)
         at = ((east - WEST_M) / GROUND_M).astype(np.float32), ((NORTH_M - north) / GROUND_M).astype(np.float32)
@@ -121,11 +124,11 @@ def places(steps: Iterable[SemidirectStep]):
     return np.array([s.frame for s in good]), np.array([s.position_m for s in good])
 
 
-def path_error(steps, frames=90, with_scale=True):
+def path_error(steps, frames=90, climb=0.0):
     """RMS distance from the true way after alignment over its length, and the scale of the alignment."""
     numbers, found = places(steps)
-    truth = way(frames)[0][numbers]
-    rotation, shift, scale = umeyama(found, truth, with_scale=with_scale)
+    truth = way(frames, climb)[0][numbers]
+    rotation, shift, scale = umeyama(found, truth, with_scale=True)
     error = truth - (scale * found @ rotation.T + shift)
     length = np.linalg.norm(np.diff(truth, axis=0), axis=1).sum()
     return np.sqrt((error**2).sum(1).mean()) / length, scale

@@ -284,10 +284,7 @@ def test_a_height_stream_gives_the_scale_and_tells_its_drift():
     given = []
     for k, picture in enumerate(pictures):
         height = 1.5 if k < 60 else 2.0  # the sensor jumps: the map did not
-        given.append(RangeSample(
-            stream="/height", t_ns=picture.t_ns, received_ns=0, range_m=height - 0.1, min_range_m=0, max_range_m=9,
-            field_of_view_rad=0.1,
-        ))  # fmt: skip
+        given.append(height_sample(picture.t_ns, height - 0.1))
         given.append(picture)
     estimator = SemidirectOdometry(flights.settings(height_m=None, height_stream="/height", height_offset_m=0.1))
     steps, _ = flights.flown(estimator, given)
@@ -297,6 +294,26 @@ def test_a_height_stream_gives_the_scale_and_tells_its_drift():
     assert all(drifted[60:])
     assert steps[70].height_m == 2.0
     assert steps[70].map_height_m == pytest.approx(flights.way(FRAMES)[0][70, 2], abs=0.03)
+
+
+def test_the_height_counts_at_the_frame_that_it_came_with():
+    # a climb of 1 m/s: between the two views of the start the height changes by a tenth
+    centres, _ = flights.way(50, 1.0)
+    given = []
+    for k, picture in enumerate(samples(flights.pictures(50, climb=1.0))):
+        given.append(height_sample(picture.t_ns, centres[k, 2]))
+        given.append(picture)
+    estimator = SemidirectOdometry(flights.settings(height_m=None, height_stream="/height"))
+    steps, _ = flights.flown(estimator, given)
+    assert flights.path_error(steps, 50, 1.0)[1] == pytest.approx(1.0, abs=0.01)
+    assert not any(Verdict.SCALE_DRIFT in s.alarms for s in steps)
+
+
+def height_sample(t_ns, height_m):
+    return RangeSample(
+        stream="/height", t_ns=t_ns, received_ns=0, range_m=height_m, min_range_m=0, max_range_m=9,
+        field_of_view_rad=0.1,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize("source", ["speed", "position"])

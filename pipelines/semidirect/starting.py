@@ -124,7 +124,7 @@ def first_map(
         pyramid: of the second view.
         found: what `begun` told.
         known: likewise.
-        height_m: height of the first camera over the plane, NaN to leave the median depth at 1.
+        height_m: height of the second camera over the plane, NaN to leave the median depth at 1.
         height_direction: whether that is over the ground or along the camera's axis.
         place: x, y of the first camera.
         heading_rad: of its u axis.
@@ -133,7 +133,9 @@ def first_map(
     which, inlier = following.which[known][found.inlier], found.inlier
     points = found.points[inlier]
     plane = plane_of(points)
-    unit = unit_of(plane, height_m, height_direction)
+    normal = found.rotation @ plane.normal
+    second = plane._replace(normal=normal, distance=plane.distance + float(normal @ found.translation))
+    unit = unit_of(second, height_m, height_direction)
     first_t_world = standing(plane.normal, plane.distance * unit, place, heading_rad)
     second_t_first = np.eye(4)
     second_t_first[:3, :3], second_t_first[:3, 3] = found.rotation, found.translation * unit
