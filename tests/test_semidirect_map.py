@@ -1,7 +1,5 @@
 """The map of the semi-direct odometry: its tables against a plain model, its growth against a known scene."""
 
-import threading
-
 import cv2
 import numpy as np
 import pytest
@@ -237,18 +235,11 @@ def test_mapping_beside_hands_on_errors_and_adjustments():
         none = np.zeros(0, np.int64)
         return Posed(number, last.pyramid, last.cam_t_world, none, np.zeros((0, 2)), none, none, 1.5)
 
-    def until(ready):
-        for _ in range(500):
-            if ready():
-                return
-            threading.Event().wait(0.01)
-        raise AssertionError("the thread did not answer")
-
     mapper = Growing()
     beside = Beside(mapper)
     beside.begin(world)
     beside.post(posed(50))
-    until(lambda: bool(beside._grown))
+    beside.wait()
     found = beside.newest()
     assert found.world is world
     assert [growth.keyframe for growth in found.growths] == [True]
@@ -257,7 +248,7 @@ def test_mapping_beside_hands_on_errors_and_adjustments():
     assert np.allclose(again.shift, np.eye(4))  # told once
     assert again.growths == ()
     beside.post(posed(99))
-    until(lambda: beside._failed is not None)
+    beside.wait()
     with pytest.raises(ValueError, match="on purpose"):
         beside.newest()
 

@@ -49,6 +49,7 @@ class Beside:
         self._grown: list[tuple[Posed, Growth]] = []
         self.dropped = 0
         """Frames that the mapping had no time for."""
+        self._busy = False
         self._failed: Exception | None = None
         threading.Thread(target=self._work, name="mapping", daemon=True).start()
 
@@ -64,7 +65,7 @@ class Beside:
         with self._change:
             self.dropped += len(self._waiting) == WAITING
             self._waiting.append(posed)
-            self._change.notify()
+            self._change.notify_all()
 
     def newest(self) -> Newest:
         """The newest map, and what was done to it since this was asked before.
@@ -84,19 +85,28 @@ class Beside:
             self._grown.clear()
             return Newest(self._world, shift, growths)
 
+    def wait(self) -> None:
+        """Wait until the frames that were given are mapped, or the mapping has failed."""
+        with self._change:
+            self._change.wait_for(lambda: self._failed is not None or not (self._waiting or self._busy))
+
     def _work(self) -> None:
         while True:
             with self._change:
                 self._change.wait_for(lambda: bool(self._waiting))
                 posed, world, epoch = self._waiting.popleft(), self._world, self._epoch
+                self._busy = True
             assert world is not None
             try:
                 growth = self._mapper.grown(world, posed)
             except Exception as error:
                 with self._change:
                     self._failed = error
+                    self._change.notify_all()
                 return
             with self._change:
+                self._busy = False
                 if epoch == self._epoch:
                     self._world = growth.world
                     self._grown.append((posed, growth))
+                self._change.notify_all()
