@@ -10,7 +10,6 @@ from pipelines.geometry import se3_exp
 from pipelines.semidirect.features import (
     CornerOptions,
     FeatureOptions,
-    Outcome,
     References,
     affine_of_plane,
     align_features,
@@ -25,6 +24,7 @@ from pipelines.semidirect.features import (
 )
 from pipelines.semidirect.optics import optics_of
 from pipelines.semidirect.pyramid import level_image, on_finest, pyramid_of, sample
+from pipelines.semidirect.step import Feature
 
 CAMERA = lens.pinhole(376, 240, 210.0, distortion=(-0.1, 0.02, 1e-3, -1e-3))
 FACING = np.array([0.0, 0.0, 1.0])
@@ -134,7 +134,7 @@ def test_analytic_shifts_are_found(shift_u: float, shift_v: float, tolerance: fl
     patch = np.empty((10, 10))
     assert warped_patch(product(0, 0), 15.5, 15.5, np.eye(2), patch)
     found = align_patch(product(shift_u, shift_v), patch, 15.5, 15.5, FeatureOptions(40, tolerance))
-    assert found.outcome == Outcome.ALIGNED
+    assert found.outcome == Feature.MATCHED
     assert np.hypot(found.u - 15.5 - shift_u, found.v - 15.5 - shift_v) < (1e-6 if tolerance < 1e-6 else 0.02)
     if tolerance < 1e-6:  # the shifted product lacks its constant 3 shift_u shift_v
         assert found.mean_difference == pytest.approx(-3 * shift_u * shift_v, abs=1e-5)
@@ -159,13 +159,13 @@ def test_the_fixed_point_has_no_gradient_in_noise() -> None:
 def test_failures_of_a_patch_have_their_causes() -> None:
     image, patch = noise_texture((40, 40), 2, 6), np.empty((10, 10))
     warped_patch(np.full((40, 40), 9, np.uint8), 20.0, 20.0, np.eye(2), patch)
-    assert align_patch(image, patch, 20.0, 20.0, FeatureOptions()).outcome == Outcome.FLAT
+    assert align_patch(image, patch, 20.0, 20.0, FeatureOptions()).outcome == Feature.FLAT
     u = np.mgrid[:40, :40][1]
     warped_patch((3 * u).astype(np.uint8), 20.0, 20.0, np.eye(2), patch)  # an edge tells nothing along itself
-    assert align_patch(image, patch, 20.0, 20.0, FeatureOptions()).outcome == Outcome.FLAT
+    assert align_patch(image, patch, 20.0, 20.0, FeatureOptions()).outcome == Feature.FLAT
     warped_patch(image, 20.0, 20.0, np.eye(2), patch)
-    assert align_patch(image, patch, 20.6, 20.5, FeatureOptions(1)).outcome == Outcome.NOT_CONVERGED
-    assert align_patch(image, patch, 2.0, 20.0, FeatureOptions()).outcome == Outcome.LEFT_IMAGE
+    assert align_patch(image, patch, 20.6, 20.5, FeatureOptions(1)).outcome == Feature.NOT_CONVERGED
+    assert align_patch(image, patch, 2.0, 20.0, FeatureOptions()).outcome == Feature.LEFT_IMAGE
 
 
 def references(pixels: np.ndarray, depth: np.ndarray, level: np.ndarray, normal: np.ndarray) -> References:
@@ -195,7 +195,7 @@ def test_points_of_a_rendered_plane_are_found() -> None:
     )
     truth = lens.project(CAMERA, moved(world, second))
     inside = np.all((truth > 30) & (truth < (345, 209)), axis=1)
-    good = found.outcome == Outcome.ALIGNED
+    good = found.outcome == Feature.MATCHED
     assert inside.sum() > 30
     assert good[inside].mean() > 0.9
     error = np.hypot(*(found.pixels - truth)[good].T)
@@ -204,7 +204,7 @@ def test_points_of_a_rendered_plane_are_found() -> None:
     assert np.median(error) < 0.05
     outside = np.any((found.predicted < 0) | (found.predicted > (375, 239)), axis=1)
     assert outside.any()
-    assert np.array_equal(outside, found.outcome == Outcome.OUT_OF_VIEW)
+    assert np.array_equal(outside, found.outcome == Feature.OUT_OF_VIEW)
     assert set(found.level[good]) >= {0, 1}
 
 
@@ -219,7 +219,7 @@ def test_what_is_not_searched_says_why() -> None:
         np.stack([image.buffer, image.buffer]), image, optics_of(CAMERA), poses, refs, FeatureOptions()
     )
     assert found.outcome.tolist() == [
-        Outcome.OUT_OF_VIEW, Outcome.OBLIQUE, Outcome.REFERENCE_OUT_OF_VIEW, Outcome.ALIGNED
+        Feature.OUT_OF_VIEW, Feature.OBLIQUE, Feature.REFERENCE_OUT_OF_VIEW, Feature.MATCHED
     ]  # fmt: skip
     assert np.allclose(found.pixels[3], pixels[3], atol=1e-9)
     assert np.isnan(found.pixels[:3]).all()

@@ -250,7 +250,7 @@ def find_points(
         found_u, found_v = float(column), float(row)
         if level >= options.align_level:
             place = align_patch(image, patch, column - PATCH_CENTRE, row - PATCH_CENTRE, options.alignment)
-            m.outcome[i] = place.outcome  # the numbers of features.Outcome are those of Feature
+            m.outcome[i] = place.outcome
             found_u, found_v = place.u + PATCH_CENTRE, place.v + PATCH_CENTRE
         m.found[i, 0], m.found[i, 1] = on_finest(found_u, level), on_finest(found_v, level)
     return m

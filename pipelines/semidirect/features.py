@@ -9,7 +9,6 @@ Gauss-Newton in (δu, δv, mean difference). Forster, Pizzoli, Scaramuzza, SVO, 
 from __future__ import annotations
 
 import math
-from enum import IntEnum
 from typing import NamedTuple
 
 import cv2
@@ -20,6 +19,7 @@ from pipelines.compiled import compiled
 from pipelines.semidirect import linear
 from pipelines.semidirect.optics import Optics, project, ray
 from pipelines.semidirect.pyramid import Grey, Pyramid, level_image, on_finest, on_level, sample
+from pipelines.semidirect.step import Feature
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -240,23 +240,10 @@ def warped_patch(image: Grey, u: float, v: float, cur_by_ref: Floats, out: Float
 # ------------------------------------------------------------------------------ feature alignment
 
 
-class Outcome(IntEnum):
-    """What became of a point's alignment."""
-
-    ALIGNED = 0
-    OUT_OF_VIEW = 1
-    OBLIQUE = 2
-    REFERENCE_OUT_OF_VIEW = 3
-    FLAT = 4
-    LEFT_IMAGE = 5
-    NOT_CONVERGED = 6
-    NOT_TRIED = 7
-
-
-_ALIGNED, _OUT_OF_VIEW, _OBLIQUE = int(Outcome.ALIGNED), int(Outcome.OUT_OF_VIEW), int(Outcome.OBLIQUE)
-_REFERENCE_OUT_OF_VIEW, _FLAT = int(Outcome.REFERENCE_OUT_OF_VIEW), int(Outcome.FLAT)
-_LEFT_IMAGE, _NOT_CONVERGED = int(Outcome.LEFT_IMAGE), int(Outcome.NOT_CONVERGED)
-_NOT_TRIED = int(Outcome.NOT_TRIED)
+_MATCHED, _OUT_OF_VIEW, _OBLIQUE = int(Feature.MATCHED), int(Feature.OUT_OF_VIEW), int(Feature.OBLIQUE)
+_REFERENCE_OUT_OF_VIEW, _FLAT = int(Feature.REFERENCE_OUT_OF_VIEW), int(Feature.FLAT)
+_LEFT_IMAGE, _NOT_CONVERGED = int(Feature.LEFT_IMAGE), int(Feature.NOT_CONVERGED)
+_NOT_TRIED = int(Feature.NOT_TRIED)
 
 
 class FeatureOptions(NamedTuple):
@@ -282,7 +269,7 @@ class Features(NamedTuple):
     """Alignments of n points; pixels on level 0, px of the level for the rest; NaN where it did not come so far.
 
     `pixels` [n, 2]; `predicted` [n, 2] the projections that they started from; `level` [n] the level searched, -1 if
-    none; `outcome` [n] an `Outcome` each; `mean_difference` [n] and `residual_rms` [n] in grey levels;
+    none; `outcome` [n] a `Feature` each; `mean_difference` [n] and `residual_rms` [n] in grey levels;
     `iterations` [n]; `affine` [n, 2, 2] from the reference's to the current level 0.
     """
 
@@ -358,7 +345,7 @@ def align_patch(image: Grey, patch: Floats, u: float, v: float, options: Feature
         if step[0] ** 2 + step[1] ** 2 < options.tolerance_px**2:
             # what the last step takes away from the squares: gᵀ H⁻¹ g
             square += by_u * step[0] + by_v * step[1] + by_mean * step[2]
-            return Found(u, v, -mean, math.sqrt(max(square, 0.0) / AREA), i + 1, _ALIGNED)
+            return Found(u, v, -mean, math.sqrt(max(square, 0.0) / AREA), i + 1, _MATCHED)
     return Found(u, v, -mean, nan, options.iterations, _NOT_CONVERGED)
 
 
