@@ -182,7 +182,7 @@ class SemidirectSettings(CameraSettings):
         accurate: dict[str, Any] = {
             "max_features": 200,
             "max_keyframes": 50,
-            "bundle_keyframes": 8,
+            "bundle_keyframes": 12,
             "min_tracked": 30,
         }
         return cls(**(accurate if name == "accurate" else {}))
