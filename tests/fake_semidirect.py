@@ -109,6 +109,8 @@ def _step(rng: np.random.Generator, frame: int, points: NDArray[np.float64], sca
         "map_point_m": points[:p],
         "map_point_sigma_m": rng.gamma(2, 0.01, p),
         "map_point_views": rng.integers(2, 9, p),
+        "mean_grey": float(rng.uniform(80, 120)),
+        "sharpness": float(rng.uniform(0.01, 0.02)),
         "prior_position_m": place,
         "prior_quat_xyzw": turn,
         "align_cost": costs,
