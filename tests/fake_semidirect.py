@@ -109,6 +109,7 @@ def _step(rng: np.random.Generator, frame: int, points: NDArray[np.float64], sca
         "map_point_m": points[:p],
         "map_point_sigma_m": rng.gamma(2, 0.01, p),
         "map_point_views": rng.integers(2, 9, p),
+        "map_point_covariance": np.einsum("pij,pkj->pik", *[rng.normal(0, 0.01, (p, 3, 3))] * 2),
         "mean_grey": float(rng.uniform(80, 120)),
         "sharpness": float(rng.uniform(0.01, 0.02)),
         "prior_position_m": place,

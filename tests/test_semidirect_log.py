@@ -7,6 +7,7 @@ from typing import Any
 import fake_semidirect as fake
 import numpy as np
 import pytest
+from scipy.spatial.transform import Rotation
 from test_rrd import assert_same, rows_of
 
 from pipelines.semidirect import depth_filter
@@ -142,6 +143,12 @@ def test_map_and_camera_are_where_the_step_says(tmp_path: Path) -> None:
     for frame in frames:
         np.testing.assert_allclose(points[frame], steps[frame].map_point_m, rtol=1e-6)
         np.testing.assert_allclose(balls[frame], steps[frame].map_point_sigma_m, rtol=1e-6)
+    halves = drawn(tmp_path / "run.rrd", "/world/runs/fast/map/covariance", "Ellipsoids3D:half_sizes")
+    turns = drawn(tmp_path / "run.rrd", "/world/runs/fast/map/covariance", "Ellipsoids3D:quaternions")
+    for frame in frames:
+        axes = Rotation.from_quat(turns[frame]).as_matrix()
+        spread = np.einsum("pij,pj,pkj->pik", axes, np.square(halves[frame]), axes)
+        np.testing.assert_allclose(spread, steps[frame].map_point_covariance, atol=1e-8)
     camera = drawn(tmp_path / "run.rrd", "/world/runs/fast/camera", "Transform3D:translation")
     assert list(camera) == [step.frame for step in steps if step.accepted]
     np.testing.assert_allclose(camera[50][0], steps[50].position_m, rtol=1e-6)

@@ -28,7 +28,9 @@ TINY = Pyramid(np.zeros(3, np.uint8), 1, 1)
 
 def empty():
     keyframes = Keyframes(np.zeros(0, np.int64), np.zeros((0, 4, 4)), np.zeros((0, 3), np.uint8))
-    points = local_map.new_points(np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros(0), PointState.KNOWN)
+    points = local_map.new_points(
+        np.zeros(0, np.int64), np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), PointState.KNOWN
+    )
     seen = Observations(np.zeros(1, np.int64), np.zeros(0, np.int64), np.zeros((0, 2)), np.zeros(0, np.int64))
     return LocalMap(keyframes, points, seen, local_map.no_filters(), 0)
 
@@ -67,7 +69,9 @@ def test_tables_are_those_of_a_plain_model(changes):
             numbers = np.array(sorted(set(rng.integers(0, 500, 5).tolist()) - set(model)))
             n = len(numbers)
             which, pixels, level = rng.integers(0, len(keyframes), n), rng.uniform(0, 99, (n, 2)), np.zeros(n, np.int64)
-            fresh = local_map.new_points(numbers, rng.normal(size=(n, 3)), np.ones(n), PointState.CANDIDATE)
+            fresh = local_map.new_points(
+                numbers, rng.normal(size=(n, 3)), np.ones((n, 3, 3)), np.ones(n), PointState.CANDIDATE
+            )
             world = local_map.with_points(world, fresh, which, pixels, level)
             for number, k, pixel in zip(numbers.tolist(), which, pixels.tolist(), strict=True):
                 model[number] = {keyframes[k]: (*pixel, 0)}
@@ -99,6 +103,7 @@ def test_scaling_a_map_changes_no_picture_of_it():
         assert np.allclose(after[:, 2], 1.7 * before[:, 2])
     assert np.allclose(larger.filters.belief[:, 0] * 1.7, world.filters.belief[:, 0])
     assert np.allclose(np.sqrt(larger.filters.belief[:, 1]) * 1.7, np.sqrt(world.filters.belief[:, 1]))
+    assert np.allclose(larger.points.covariance, world.points.covariance * 1.7**2, equal_nan=True)
     fixed = local_map.scaled(world, 1.7, local_map.centre_of(world.keyframes.cam_t_world[0]))
     assert np.allclose(fixed.keyframes.cam_t_world[0], world.keyframes.cam_t_world[0])
 
@@ -124,6 +129,10 @@ def test_points_of_the_filters_lie_on_the_ground():
     z = world.points.place[:, 2]
     assert np.abs(np.median(z[fresh])) < 0.01
     assert np.percentile(np.abs(z), 95) < 0.04
+    # along the ray of the first view the covariance is σ², across it about a pixel
+    spread = np.linalg.eigvalsh(world.points.covariance[fresh])
+    assert np.allclose(np.sqrt(spread[:, 2]), np.maximum(world.points.sigma[fresh], np.sqrt(spread[:, 1])), rtol=1e-6)
+    assert np.median(np.sqrt(spread[:, 0])) == pytest.approx(1.5 / flights.FOCAL, rel=0.2)
     known = np.isfinite(world.points.sigma)
     # σ is that of errors of a whole pixel: they are smaller
     assert 0.05 < np.std(z[known] / world.points.sigma[known]) < 3

@@ -343,7 +343,9 @@ def visual_blueprint(step_type: type[Step], run: str, estimator: str, bounds: Bo
 def _visual_maps(run: str, bounds: Bounds) -> rrb.Tabs:
     """The map in space, with the reference laid over the path, and from above, with the reference as it is."""
     world = f"/world/runs/{run}"
-    hidden: dict[Any, Any] = {f"{world}/map/sigma": rrb.EntityBehavior(visible=False)}
+    hidden: dict[Any, Any] = {
+        f"{world}/map/{name}": rrb.EntityBehavior(visible=False) for name in ("sigma", "covariance")
+    }
     eye = None
     if bounds.extent is not None:
         reach = bounds.extent.size_m + 2 * bounds.height_m

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 import rerun as rr
+from scipy.spatial.transform import Rotation
 
 from pipelines.semidirect.step import Stage
 from workbench import traces
@@ -133,6 +134,8 @@ class VisualDrawing(Drawing):
             columns = rr.Points3D.columns(positions=points.values.astype(np.float32), colors=colours)
             self.send(f"{self.world}/map/points", at, columns.partition(points.counts))
             self._uncertain(at, points, sigma)
+            if "map_point_covariance" in table:
+                self._ellipsoids(at, points, np.concatenate(table["map_point_covariance"][changed]))
         framed = np.array([len(ids) > 0 for ids in table["keyframe_number"]])
         if framed.any() and self.scene is not None:
             self._keyframes(table, framed)
@@ -143,6 +146,19 @@ class VisualDrawing(Drawing):
         some = points.chosen(known)
         columns = rr.Points3D.columns(positions=some.values.astype(np.float32), radii=sigma[known].astype(np.float32))
         self.send(f"{self.world}/map/sigma", at, columns.partition(some.counts))
+
+    def _ellipsoids(self, at: traces.Columns, points: Joined, covariance: Floats) -> None:
+        """The points as ellipsoids of one standard deviation, where their covariance is known."""
+        known = np.asarray(np.isfinite(covariance).all(axis=(1, 2)))
+        some = points.chosen(known)
+        variance, axes = np.linalg.eigh(covariance[known])
+        axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]  # right-handed
+        columns = rr.Ellipsoids3D.columns(
+            centers=some.values.astype(np.float32),
+            half_sizes=np.sqrt(np.maximum(variance, 0.0)).astype(np.float32),
+            quaternions=Rotation.from_matrix(axes).as_quat().astype(np.float32) if len(axes) else np.zeros((0, 4)),
+        )
+        self.send(f"{self.world}/map/covariance", at, columns.partition(some.counts))
 
     def _keyframes(self, table: traces.Columns, framed: Any) -> None:
         at = {"frame": table["frame"][framed], "t_ns": table["t_ns"][framed]}

@@ -382,6 +382,7 @@ SEMIDIRECT = Schema(
     SemidirectStep,
     (
         *VISUAL,
+        Row("map_point_covariance", "map/points", _LIST, also=_MAP("covariance")),
         Row("mean_grey", "image/grey", title="mean grey"),
         Row("sharpness", "image/sharpness", title="sharpness"),
         Row("prior_position_m", "prior/position", axes=_XYZ, title="prior"),
@@ -572,6 +573,7 @@ end, then the next one that starts.
 | `/world/runs/RUN/above/path`, `/body`, `/heading` | the path seen from above |
 | `/world/runs/RUN/map/points` | the map's points, green where σ is 0.1 % of the scene's depth, red at 10 % |
 | `/world/runs/RUN/map/sigma` | the same as balls of radius σ, hidden until switched on |
+| `/world/runs/RUN/map/covariance` | the same as ellipsoids of one standard deviation (semidirect), hidden likewise |
 | `/world/runs/RUN/map/keyframes`, `/plane` | frusta of the keyframes; z = 0, the first map's plane, as a grid |
 """
 

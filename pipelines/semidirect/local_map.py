@@ -46,13 +46,15 @@ class Keyframes(NamedTuple):
 class Points(NamedTuple):
     """P points.
 
-    `number` [P] ascending; `place` [P, 3] in the world; `sigma` [P] along the ray of the first view; `state` [P] a
+    `number` [P] ascending; `place` [P, 3] in the world with its `covariance` [P, 3, 3] for errors of 1 px, NaN
+    while unknown; `sigma` [P] along the ray of the first view; `state` [P] a
     `PointState`; `found` [P] frames that found it, `missed` [P] frames in a row that did not; `stale` [P]: 1 where
     its views changed since it was last refined.
     """
 
     number: Longs
     place: Floats
+    covariance: Floats
     sigma: Floats
     state: Longs
     found: Longs
@@ -111,10 +113,10 @@ def no_filters() -> Filters:
     return Filters(whole, whole, np.zeros((0, 2)), whole, np.zeros((0, 3)), np.zeros((0, 4)), zero, whole)
 
 
-def new_points(number: Longs, place: Floats, sigma: Floats, state: PointState) -> Points:
+def new_points(number: Longs, place: Floats, covariance: Floats, sigma: Floats, state: PointState) -> Points:
     """Points that no frame has looked for yet."""
     zeros = np.zeros(len(number), np.int64)
-    return Points(number, place, sigma, np.full(len(number), int(state)), zeros, zeros, zeros)
+    return Points(number, place, covariance, sigma, np.full(len(number), int(state)), zeros, zeros, zeros)
 
 
 def rows_of(numbers: Longs, wanted: Longs) -> Longs:
@@ -224,7 +226,11 @@ def scaled(world: LocalMap, factor: float, about: Floats) -> LocalMap:
     poses = world.keyframes.cam_t_world.copy()
     for pose in poses:
         pose[:3, 3] = -pose[:3, :3] @ moved(centre_of(pose))
-    points = world.points._replace(place=moved(world.points.place), sigma=world.points.sigma * factor)
+    points = world.points._replace(
+        place=moved(world.points.place),
+        covariance=world.points.covariance * factor**2,
+        sigma=world.points.sigma * factor,
+    )
     belief = world.filters.belief / np.array([factor, factor**2, 1, 1])
     filters = world.filters._replace(belief=belief, reach=world.filters.reach / factor)
     return world._replace(keyframes=world.keyframes._replace(cam_t_world=poses), points=points, filters=filters)

@@ -252,7 +252,9 @@ class Mapper:
         in_key = done.bearing / mu[:, None]
         place = centres_of(poses) + np.einsum("nji,nj->ni", poses[:, :3, :3], in_key)
         sigma = np.sqrt(variance) / mu**2
-        points = new_points(done.number, place, sigma, PointState.CANDIDATE)
+        ray = np.einsum("nji,nj->ni", poses[:, :3, :3], done.bearing)
+        covariance = covariance_on_ray(ray, sigma, 1 / (mu * self.optics.focal_u))
+        points = new_points(done.number, place, covariance, sigma, PointState.CANDIDATE)
         return with_points(world, points, rows, done.pixel, done.level)
 
     def _without_old_filters(self, world: LocalMap) -> tuple[LocalMap, int]:
@@ -278,7 +280,11 @@ class Mapper:
         place, sigma, stale = points.place.copy(), points.sigma.copy(), points.stale.copy()
         place[rows], stale[rows] = done.points, 0
         sigma[rows] = _along_ray(done.covariance, done.points, world, rows, sigma[rows])
-        return world._replace(points=points._replace(place=place, sigma=sigma, stale=stale)), len(rows)
+        covariance = points.covariance.copy()
+        told = np.isfinite(done.covariance).all(axis=(1, 2))
+        covariance[rows[told]] = done.covariance[told]
+        refined = points._replace(place=place, covariance=covariance, sigma=sigma, stale=stale)
+        return world._replace(points=refined), len(rows)
 
     def _bundled(self, world: LocalMap) -> tuple[LocalMap, Bundle | None, int, int]:
         """Local bundle adjustment over the last keyframe and those that share most points with it."""
@@ -318,6 +324,12 @@ class Mapper:
 
 
 # ---------------------------------------------------------------------------------- helpers
+
+
+def covariance_on_ray(ray: Floats, along: Floats, across: Floats) -> Floats:
+    """Covariance [n, 3, 3] of points by σ [n] along their unit rays [n, 3] and across: σ∥² f fᵀ + σ⊥² (I - f fᵀ)."""
+    on_ray = ray[:, :, None] * ray[:, None, :]
+    return np.asarray(along[:, None, None] ** 2 * on_ray + across[:, None, None] ** 2 * (np.eye(3) - on_ray))
 
 
 def nearest_keyframe(world: LocalMap, cam_t_world: Floats) -> float:

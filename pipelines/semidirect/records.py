@@ -30,6 +30,7 @@ def blank_fields(s: SemidirectSettings) -> dict[str, Any]:
     return {
         "accepted": False,
         "stage": int(Stage.SKIPPED),
+        "map_point_covariance": np.zeros((0, 3, 3)),
         "mean_grey": np.nan,
         "sharpness": np.nan,
         "pose_sigma": _NAN6,
@@ -209,6 +210,7 @@ def map_fields(world: LocalMap) -> dict[str, Any]:
         "map_id": world.points.number,
         "map_point_m": world.points.place,
         "map_point_sigma_m": world.points.sigma,
+        "map_point_covariance": world.points.covariance,
         "map_point_views": np.diff(world.seen.first),
     }
 

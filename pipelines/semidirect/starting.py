@@ -154,7 +154,7 @@ def first_map(
         np.concatenate([first.level[which], first.level[which]]),
         n,
     )
-    table = new_points(next_number + rows, places, sigma, PointState.KNOWN)
+    table = new_points(next_number + rows, places, np.full((n, 3, 3), np.nan), sigma, PointState.KNOWN)
     table = table._replace(stale=np.ones(n, np.int64))
     world = LocalMap(keyframes, table, seen, no_filters(), next_number + n)
     return FirstMap(world, float(np.median(points[:, 2])) * unit, unit)

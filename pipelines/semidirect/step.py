@@ -116,7 +116,8 @@ class VisualStep(Step):
 class SemidirectStep(VisualStep):
     """One frame of the semi-direct odometry."""
 
-    # 0. the image
+    # 0. the image, the map's covariances
+    map_point_covariance: Floats = quantity("m²", "covariance of the map's points, for errors of 1 px", "P", 3, 3)
     mean_grey: float = quantity("grey", "mean grey level of the coarsest level")
     sharpness: float = quantity("1", "mean squared step along the rows over the squared mean grey level")
 
