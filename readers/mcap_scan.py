@@ -60,6 +60,7 @@ class Scan:
         self.run_start = -1
         self.closed = False
         self.unchecked = 0
+        self.summed = False  # the checksum of the whole data section was there to compare with
         self.cost: Counter[Channel] = Counter()
         self.loose: list[McapBlock] = []
         self.chunked = False
@@ -150,6 +151,7 @@ class Scan:
     def _data_end(self, at: int, body: memoryview) -> None:
         """Compare the whole data section with its checksum where messages have none of their own."""
         stated = int.from_bytes(body[:4], "little")
+        self.summed = stated != 0
         if stated and self.unchecked and crc32(self.view[self.segment.start : at]) != stated:
             text = f"the data do not match their checksum; {self.unchecked} messages have no other and may be wrong"
             self.log.report(Cause.CHECKSUM, text, self.segment.start, self.segment.start)
@@ -180,7 +182,7 @@ class Scan:
         self.log.report(Cause.ORDER, "another log begins; the two were joined and both are read", at, at)
         self._end_segment()
         self.segment = Segment(start=at, profile=self.log.profile(at))
-        self.closed, self.unchecked = False, 0
+        self.closed, self.summed, self.unchecked = False, False, 0
         return at + len(MAGIC)
 
     # ------------------------------------------------------------------------------ blocks
@@ -342,6 +344,7 @@ class Scan:
         """Withhold messages outside of chunks where others lie in chunks with checksums and the file is damaged.
 
         They may be the inside of a chunk whose beginning is damaged, or other records that turned into messages.
+        Where no other chunk tells whether that is so they are read, and it is said that nothing proves them.
         """
         loose, self.loose = self.loose, []
         damaged = len(self.log.losses) > self.losses or (self.fault and self._count_differs())
@@ -349,6 +352,10 @@ class Scan:
             self.log.withhold(loose)
             for block in loose:
                 self.cost.update(block.counts)
+        elif loose and not self.summed and (damaged or not self.closed):
+            count = sum(sum(block.counts.values()) for block in loose)
+            text = f"{count} messages outside of chunks are read without a checksum and may be wrong"
+            self.log.report(Cause.CHECKSUM, text, self.segment.start, self.segment.start)
         self.chunked = False
 
     def _count_differs(self) -> bool:
