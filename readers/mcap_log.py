@@ -12,6 +12,7 @@ from collections import OrderedDict
 from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
+from itertools import pairwise
 from pathlib import Path
 from types import MappingProxyType
 
@@ -23,9 +24,9 @@ from readers.index_cache import Entry, State
 from readers.index_states import mcap_state, put_mcap
 from readers.mcap_extras import ExtrasWalk
 from readers.mcap_records import (
+    ENTRY_BYTES,
     FOOTER,
     HEAD,
-    INDEX_ENTRY,
     INDEX_HEAD,
     MAGIC,
     ChannelRecord,
@@ -173,7 +174,7 @@ class McapLog(IndexedLog):
                 self.describe(segment, opcode, body)
         if self.statistics is None or any(not index.indexes for index in indexes):
             return False
-        if not all(set(index.indexes) <= set(segment.channels) for index in indexes):
+        if not all(index.indexes.keys() <= segment.channels.keys() for index in indexes):
             return False
         if any(record.schema and record.schema not in segment.schemas for record in segment.records.values()):
             return False
@@ -183,20 +184,38 @@ class McapLog(IndexedLog):
     def _block(self, segment: Segment, index: ChunkIndex, limit: int) -> McapBlock:
         if index.offset + index.length > limit or index.length < HEAD.size or index.first_ns > index.last_ns:
             raise RecordError
-        indexes, counts = {}, {}
-        for number, at in index.indexes.items():
-            channel = segment.channels[number]
-            indexes[channel], counts[channel] = at, self._indexed_count(number, at)
+        channels = [segment.channels[number] for number in index.indexes]
         return McapBlock(
             index.offset,
             index.length,
             index.first_ns,
             index.last_ns,
-            counts,
+            dict(zip(channels, self._indexed_counts(index), strict=True)),
             segment=segment,
             stated=Stated(index.compression, index.packed_bytes, index.unpacked_bytes),
-            indexes=indexes,
+            indexes=dict(zip(channels, index.indexes.values(), strict=True)),
         )
+
+    def _indexed_counts(self, index: ChunkIndex) -> list[int]:
+        """How many messages each message index of a chunk lists.
+
+        They lie one behind the other behind the chunk, so that the next one's place tells their length without a look
+        at the file; where that does not work out they are read.
+
+        Raises:
+            RecordError: there is no such message index.
+        """
+        behind = index.offset + index.length
+        places = [*index.indexes.values(), behind + index.index_bytes]
+        counts: list[int] = []
+        for start, stop in pairwise(places) if places[0] == behind else ():
+            count, rest = divmod(stop - start - INDEX_HEAD.size, ENTRY_BYTES)
+            if rest or count < 0:
+                break
+            counts.append(count)
+        if len(counts) == len(index.indexes):
+            return counts
+        return [self._indexed_count(number, at) for number, at in index.indexes.items()]
 
     def _indexed_count(self, number: int, at: int) -> int:
         """How many messages the message index at `at` lists.
@@ -207,9 +226,9 @@ class McapLog(IndexedLog):
         if at + INDEX_HEAD.size > len(self.view):
             raise RecordError
         opcode, length, found, size = INDEX_HEAD.unpack_from(self.view, at)
-        if opcode != Opcode.MESSAGE_INDEX or found != number or size % INDEX_ENTRY.itemsize or size + 6 > length:
+        if opcode != Opcode.MESSAGE_INDEX or found != number or size % ENTRY_BYTES or size + 6 > length:
             raise RecordError
-        return int(size) // INDEX_ENTRY.itemsize
+        return int(size) // ENTRY_BYTES
 
     def _agrees(self, segment: Segment, statistics: Statistics) -> bool:
         """Whether the indexes and the statistics count the same messages; keeps the counts."""

@@ -35,6 +35,7 @@ _STATISTICS = struct.Struct("<QHIIIIQQ")
 _TWO_U16 = struct.Struct("<HH")
 _U16, _U32, _U64 = struct.Struct("<H"), struct.Struct("<I"), struct.Struct("<Q")
 INDEX_ENTRY = np.dtype([("log_ns", "<u8"), ("offset", "<u8")])
+ENTRY_BYTES = INDEX_ENTRY.itemsize
 
 
 class Opcode(enum.IntEnum):
@@ -149,13 +150,17 @@ def read_channel(body: memoryview) -> tuple[int, ChannelRecord]:
 
 
 class ChunkIndex(NamedTuple):
-    """Where a chunk lies and what is in it; `indexes` are the offsets of its message indexes by channel number."""
+    """Where a chunk lies and what is in it; `indexes` are the offsets of its message indexes by channel number.
+
+    These take `index_bytes` together.
+    """
 
     first_ns: int
     last_ns: int
     offset: int
     length: int
     indexes: dict[int, int]
+    index_bytes: int
     compression: str
     packed_bytes: int
     unpacked_bytes: int
@@ -167,12 +172,12 @@ def read_chunk_index(body: memoryview) -> ChunkIndex:
         first_ns, last_ns, offset, length, size = _CHUNK_INDEX.unpack_from(body)
         end = _CHUNK_INDEX.size + size
         pairs = dict(_pairs(_OFFSET, body[_CHUNK_INDEX.size : end]))
-        _, size = _LENGTH_AND_NAME.unpack_from(body, end)
+        index_bytes, size = _LENGTH_AND_NAME.unpack_from(body, end)
         compression = body[end + _LENGTH_AND_NAME.size :][:size]
         packed, unpacked = _SIZES.unpack_from(body, end + _LENGTH_AND_NAME.size + size)
     except struct.error as error:
         raise RecordError from error
-    return ChunkIndex(first_ns, last_ns, offset, length, pairs, text(compression), packed, unpacked)
+    return ChunkIndex(first_ns, last_ns, offset, length, pairs, index_bytes, text(compression), packed, unpacked)
 
 
 def _pairs(layout: struct.Struct, packed: memoryview) -> Iterator[tuple[int, int]]:
@@ -200,7 +205,7 @@ def read_message_index(body: memoryview) -> tuple[int, NDArray[np.void]]:
     """The channel's number, and log time and offset of each of its messages in a chunk."""
     number, _ = _unpack(_INDEX, body)
     entries, end = _sized(body, 2)
-    if len(entries) % INDEX_ENTRY.itemsize or len(body) - end >= INDEX_ENTRY.itemsize:
+    if len(entries) % ENTRY_BYTES or len(body) - end >= ENTRY_BYTES:
         raise RecordError
     return number, np.frombuffer(entries, INDEX_ENTRY)
 
@@ -369,7 +374,7 @@ class Segment:
     channels: dict[int, Channel] = field(default_factory=dict)
 
 
-@dataclass(frozen=True, slots=True, kw_only=True, eq=False)
+@dataclass(slots=True, kw_only=True, eq=False)
 class McapBlock(Block):
     """A chunk, or a run of messages outside of chunks.
 

@@ -193,10 +193,11 @@ class MessageLog(abc.ABC):
         """Release the file."""
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True, eq=False)
 class Block:
     """A stretch of a file that is read at once: a chunk, or a run of messages outside of chunks.
 
+    It is never changed, yet not frozen: large logs have many, and frozen ones take three times as long to make.
     `counts` says how many messages of each channel it holds. `torn` marks a block that the end of the file cuts:
     what it holds up to there is read.
     """
@@ -321,7 +322,7 @@ def _unpack(compression: str, data: Buffer, size: int, limit: int, torn: bool) -
 
 def text(raw: Buffer) -> str:
     """Decode UTF-8; bytes that are not UTF-8 come out as backslash escapes."""
-    return bytes(raw).decode("utf-8", "backslashreplace")
+    return str(raw, "utf-8", "backslashreplace")
 
 
 def name(raw: Buffer) -> str:

@@ -387,3 +387,33 @@ def test_the_data_checksum_guards_messages_that_have_no_other(tmp_path: Path) ->
     assert len(found) == 24
     assert [loss.what for loss in log.losses] == [Cause.CHECKSUM]
     assert "24 messages have no other" in log.losses[0].text
+
+
+@pytest.mark.parametrize(("more", "by_index"), [(0, True), (1, True), (16, False)])
+def test_the_length_of_the_message_indexes_is_not_trusted(tmp_path: Path, more: int, by_index: bool) -> None:
+    """One that cannot be is passed over for the indexes themselves; one that could be is seen by the statistics."""
+    path = tmp_path / "a.mcap"
+    log = made(path)
+    summary = int.from_bytes(log.data[-28:-20], "little")
+    at = log.data.index(struct.pack("<Q", log.chunks[3][0]), summary) + 16  # its offset, its length, its index offsets
+    (offsets_bytes,) = struct.unpack_from("<I", log.data, at)
+    at += 4 + offsets_bytes
+    (size,) = struct.unpack_from("<Q", log.data, at)
+    data = log.data[:at] + struct.pack("<Q", size + more) + log.data[at + 8 : -12] + bytes(4) + log.data[-8:]
+    path.write_bytes(data)
+    found, opened = read(path)
+    assert sorted(found) == sorted(log.keys)
+    assert (not opened.notes) == by_index
+
+
+def test_messages_that_nothing_proves_are_said_to_be_unproven(tmp_path: Path) -> None:
+    """A cut file whose first chunk lost its head looks like messages outside of chunks."""
+    path = tmp_path / "a.mcap"
+    log = made(path, "none")
+    start, length, _ = log.chunks[0]
+    damaged = bytearray(log.data[: start + length // 2])
+    damaged[start : start + 40] = bytes(40)
+    path.write_bytes(damaged)
+    found, opened = read(path)
+    assert found
+    assert any("without a checksum" in loss.text for loss in opened.losses)
