@@ -6,11 +6,13 @@ its first messages tell its frame, whether its stamps are a clock, and how far t
 
 from __future__ import annotations
 
+import heapq
 import itertools
 import statistics
 from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
+from operator import attrgetter
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
@@ -422,12 +424,12 @@ class LogRecording(Recording):
     def _messages(
         self, channels: Collection[Channel], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterator[Message]:
-        sources: list[Source] = []
+        sources: list[Iterable[Source]] = []
         for log in self._logs:
             own = [channel for channel in log.channels if channel in channels]
             if own:
-                sources.extend(log.sources(own, start_ns, stop_ns))
-        return in_log_order(sources)
+                sources.append(log.sources(own, start_ns, stop_ns))
+        return in_log_order(heapq.merge(*sources, key=attrgetter("first_ns")))
 
     def read(
         self,

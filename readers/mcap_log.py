@@ -8,11 +8,12 @@ from __future__ import annotations
 
 import mmap
 import time
-from collections import OrderedDict
+from collections import OrderedDict, deque
 from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
-from itertools import pairwise
+from itertools import islice, pairwise
+from operator import attrgetter
 from pathlib import Path
 from types import MappingProxyType
 
@@ -49,7 +50,7 @@ from readers.mcap_records import (
     walk,
 )
 from readers.mcap_scan import Scan
-from readers.message_log import Block, Channel, IndexedLog, Message, Source, crc32
+from readers.message_log import Channel, Message, MessageLog, Source, crc32
 from readers.salvage import Cause, Loss, Tally
 from readers.streams import RecordingError
 
@@ -61,7 +62,7 @@ WORTH_A_THREAD_BYTES = {"zstd": 1 << 16, "lz4": 1 << 23}  # lz4 unpacks about as
 _DEFAULT_ENCODING = {"ros1": "ros1", "ros2": "cdr"}
 
 
-class McapLog(IndexedLog):
+class McapLog(MessageLog):
     """One MCAP file.
 
     Raises:
@@ -76,6 +77,7 @@ class McapLog(IndexedLog):
             self._map = mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ)
         self.view = memoryview(self._map)
         self.statistics: Statistics | None = None
+        self._blocks: list[McapBlock] = []
         self._unpacked: OrderedDict[int, Future[Unpacked]] = OrderedDict()
         self._checked: set[int] = set()
         self.told: set[int] = set()
@@ -99,13 +101,13 @@ class McapLog(IndexedLog):
             begun = time.perf_counter()
             self._blocks.clear()
             Scan(self, segment, fault).run()
-            blocks = [block for block in self._blocks if isinstance(block, McapBlock)]
-            self.keep(lambda: mcap_state(self, blocks), time.perf_counter() - begun)
+            self.keep(lambda: mcap_state(self, self._blocks), time.perf_counter() - begun)
+        self._blocks.sort(key=attrgetter("first_ns"))
         if segment.profile:
             self.format = f"MCAP, profile {segment.profile}"
 
     def _put(self, state: State) -> None:
-        self._blocks = [*put_mcap(self, state)]
+        self._blocks = put_mcap(self, state)
 
     def profile(self, start: int) -> str:
         """The profile of the file that begins at `start`, "" if its header is damaged."""
@@ -284,13 +286,12 @@ class McapLog(IndexedLog):
 
     def _find_edges(self) -> None:
         """Fill in the first and last log time of every channel, from the message indexes that can hold them."""
-        blocks = [block for block in self._blocks if isinstance(block, McapBlock)]
-        for block in sorted(blocks, key=lambda b: b.first_ns):
+        for block in sorted(self._blocks, key=attrgetter("first_ns")):
             for channel in block.counts:
                 if channel.first_ns < 0 or block.first_ns < channel.first_ns:
                     found = self._indexed_times(block, channel)[0]
                     channel.first_ns = found if channel.first_ns < 0 else min(found, channel.first_ns)
-        for block in sorted(blocks, key=lambda b: -b.last_ns):
+        for block in sorted(self._blocks, key=attrgetter("last_ns"), reverse=True):
             for channel in block.counts:
                 if block.last_ns > channel.last_ns:
                     channel.last_ns = max(self._indexed_times(block, channel)[1], channel.last_ns)
@@ -386,21 +387,16 @@ class McapLog(IndexedLog):
         return True
 
     def _select(
-        self, block: Block, channels: Collection[Channel], start_ns: int | None, stop_ns: int | None
-    ) -> Iterator[Message]:
-        return self._chosen(block, (), channels, start_ns, stop_ns, keep=True)
-
-    def _chosen(
         self,
-        block: Block,
-        ahead: Collection[McapBlock],
+        block: McapBlock,
         channels: Collection[Channel],
         start_ns: int | None,
         stop_ns: int | None,
+        ahead: Collection[McapBlock] = (),
         *,
-        keep: bool,
+        keep: bool = True,
     ) -> Iterator[Message]:
-        assert isinstance(block, McapBlock)
+        """Messages of `channels` in the block with ``start_ns <= log time < stop_ns``, in the order of log time."""
         unpacked = self._load(block, ahead, keep=keep)
         if unpacked.withheld:
             return iter(())
@@ -431,21 +427,37 @@ class McapLog(IndexedLog):
     ) -> Iterable[Source]:
         """One source a block that holds one of the channels and overlaps the range, see `MessageLog.sources`."""
         wanted = frozenset(channels)
-        blocks = [
+        blocks = (
             block
-            for block in sorted(self._blocks, key=lambda block: block.first_ns)
-            if isinstance(block, McapBlock)
-            and (start_ns is None or block.last_ns >= start_ns)
+            for block in self._blocks
+            if (start_ns is None or block.last_ns >= start_ns)
             and (stop_ns is None or block.first_ns < stop_ns)
             and not wanted.isdisjoint(block.counts)
-        ]
-        for place, block in enumerate(blocks):
-            ahead = blocks[place + 1 : place + 1 + READ_AHEAD] if place >= SHORT_READ else ()
-
-            open_it = partial(
-                self._chosen, block, ahead, wanted, start_ns, stop_ns, keep=start_ns is None and place < KEPT_BLOCKS
-            )
+        )
+        coming, place = deque(islice(blocks, 1 + READ_AHEAD)), 0
+        while coming:
+            block = coming.popleft()
+            ahead = tuple(coming) if place >= SHORT_READ else ()
+            keep = start_ns is None and place < KEPT_BLOCKS
+            open_it = partial(self._select, block, wanted, start_ns, stop_ns, ahead, keep=keep)
             yield Source(block.first_ns, open_it, block.last_ns)
+            coming.extend(islice(blocks, 1))
+            place += 1
+
+    def count_before(self, channels: Collection[Channel], stop_ns: int) -> int:
+        """How many messages of `channels` were logged before `stop_ns`, by the index for all but the last blocks.
+
+        The messages of a damaged block that has an index are counted, so that the later ones keep their numbers.
+        """
+        wanted, total = frozenset(channels), 0
+        for block in self._blocks:
+            if block.first_ns >= stop_ns or wanted.isdisjoint(block.counts):
+                continue
+            if block.last_ns < stop_ns:
+                total += sum(block.counts.get(channel, 0) for channel in wanted)
+            else:
+                total += sum(1 for _ in self._select(block, wanted, None, stop_ns))
+        return total
 
     def add_block(self, block: McapBlock) -> None:
         """Take a block that a scan found."""
@@ -465,8 +477,8 @@ class McapLog(IndexedLog):
     def extras(self) -> Extras:
         """Attachments and metadata; the file is walked over once, from record to record."""
         if self._extras is None:
-            segment = next((block.segment for block in self._blocks if isinstance(block, McapBlock)), Segment())
-            self._extras = ExtrasWalk(self, segment).run()
+            first = min(self._blocks, key=attrgetter("offset"), default=None)
+            self._extras = ExtrasWalk(self, first.segment if first is not None else Segment()).run()
         return self._extras
 
     def close(self) -> None:

@@ -9,13 +9,13 @@ import enum
 import struct
 from collections import Counter
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import KW_ONLY, dataclass, field, replace
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from readers.message_log import Block, Channel, DamagedBlockError, Message, crc32, inflate, name, text
+from readers.message_log import Channel, DamagedBlockError, Message, crc32, inflate, name, text
 from readers.salvage import Cause
 
 MAGIC = b"\x89MCAP0\r\n"
@@ -374,13 +374,23 @@ class Segment:
     channels: dict[int, Channel] = field(default_factory=dict)
 
 
-@dataclass(slots=True, kw_only=True, eq=False)
-class McapBlock(Block):
-    """A chunk, or a run of messages outside of chunks.
+@dataclass(slots=True, eq=False)
+class McapBlock:
+    """A stretch of the file that is read at once: a chunk, or a run of messages outside of chunks.
 
-    `stated` is what the chunk index says of it, `indexes` the offsets of its message indexes by channel.
+    `counts` says how many messages of each channel it holds. `torn` marks a block that the end of the file cuts: what
+    it holds up to there is read. `stated` is what the chunk index says of it, `indexes` the offsets of its message
+    indexes by channel. It is never changed, yet not frozen: large logs have many, and frozen ones take three times as
+    long to make.
     """
 
+    offset: int
+    size: int
+    first_ns: int
+    last_ns: int
+    counts: Mapping[Channel, int]
+    torn: bool = False
+    _: KW_ONLY
     segment: Segment
     chunk: bool = True
     stated: Stated | None = None

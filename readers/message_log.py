@@ -11,9 +11,8 @@ import bz2
 import heapq
 import re
 import threading
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass, field
-from functools import partial
 from pathlib import Path
 from typing import NamedTuple, Protocol
 
@@ -98,18 +97,17 @@ class Source(NamedTuple):
 
 
 def in_log_order(sources: Iterable[Source]) -> Iterator[Message]:
-    """Merge sources by log time; a source is opened when the merge has come to its first time.
+    """Merge sources, which come in the order of their first times, by log time.
 
-    So memory is bounded by the sources that overlap in time. Equal times keep the order of the sources. A source
-    that overlaps no other is passed on as it is.
+    A source is asked for and opened when the merge has come to its first time, so memory is bounded by the sources
+    that overlap in time, and the first messages of a log of many do not cost a look at all. Equal times keep the order
+    of the sources. A source that overlaps no other is passed on as it is.
     """
-    ordered = sorted(enumerate(sources), key=lambda pair: pair[1].first_ns)
     heap: list[tuple[int, int, Message, Iterator[Message]]] = []
-    for place, (number, source) in enumerate(ordered):
-        following_ns = ordered[place + 1][1].first_ns if place + 1 < len(ordered) else None
+    for number, (source, following) in enumerate(_with_following(sources)):
         while heap and heap[0][0] < source.first_ns:
             yield _advance(heap)
-        if not heap and (following_ns is None or (source.last_ns is not None and source.last_ns < following_ns)):
+        if not heap and (following is None or (source.last_ns is not None and source.last_ns < following.first_ns)):
             yield from source.open()
             continue
         messages = source.open()
@@ -117,6 +115,16 @@ def in_log_order(sources: Iterable[Source]) -> Iterator[Message]:
             heapq.heappush(heap, (first.log_ns, number, first, messages))
     while heap:
         yield _advance(heap)
+
+
+def _with_following(sources: Iterable[Source]) -> Iterator[tuple[Source, Source | None]]:
+    """Each source with the one after it, None after the last."""
+    remaining = iter(sources)
+    source = next(remaining, None)
+    while source is not None:
+        following = next(remaining, None)
+        yield source, following
+        source = following
 
 
 def _advance(heap: list[tuple[int, int, Message, Iterator[Message]]]) -> Message:
@@ -178,7 +186,10 @@ class MessageLog(abc.ABC):
     def sources(
         self, channels: Collection[Channel], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterable[Source]:
-        """Where the messages of `channels` with ``start_ns <= log time < stop_ns`` can be read."""
+        """Where the messages of `channels` with ``start_ns <= log time < stop_ns`` can be read.
+
+        In the order of their first times; one is made when it is asked for.
+        """
 
     def count_before(self, channels: Collection[Channel], stop_ns: int) -> int:
         """How many messages of `channels` were logged before `stop_ns`."""
@@ -191,70 +202,6 @@ class MessageLog(abc.ABC):
     @abc.abstractmethod
     def close(self) -> None:
         """Release the file."""
-
-
-@dataclass(slots=True, eq=False)
-class Block:
-    """A stretch of a file that is read at once: a chunk, or a run of messages outside of chunks.
-
-    It is never changed, yet not frozen: large logs have many, and frozen ones take three times as long to make.
-    `counts` says how many messages of each channel it holds. `torn` marks a block that the end of the file cuts:
-    what it holds up to there is read.
-    """
-
-    offset: int
-    size: int
-    first_ns: int
-    last_ns: int
-    counts: Mapping[Channel, int]
-    torn: bool = False
-
-    @property
-    def channels(self) -> frozenset[Channel]:
-        """The channels of which the block holds messages."""
-        return frozenset(self.counts)
-
-
-class IndexedLog(MessageLog):
-    """A log whose messages lie in blocks, of each of which it is known what it holds."""
-
-    def __init__(self, path: Path, form: str, cached: Entry | None = None) -> None:
-        super().__init__(path, form, cached)
-        self._blocks: list[Block] = []
-
-    @abc.abstractmethod
-    def _select(
-        self, block: Block, channels: Collection[Channel], start_ns: int | None, stop_ns: int | None
-    ) -> Iterator[Message]:
-        """Messages of `channels` in the block with ``start_ns <= log time < stop_ns``, in the order of log time."""
-
-    def sources(
-        self, channels: Collection[Channel], start_ns: int | None = None, stop_ns: int | None = None
-    ) -> Iterable[Source]:
-        """One source a block that holds one of the channels and overlaps the range."""
-        wanted = frozenset(channels)
-        for block in self._blocks:
-            if start_ns is not None and block.last_ns < start_ns:
-                continue
-            if stop_ns is not None and block.first_ns >= stop_ns:
-                continue
-            if wanted & block.channels:
-                yield Source(block.first_ns, partial(self._select, block, wanted, start_ns, stop_ns))
-
-    def count_before(self, channels: Collection[Channel], stop_ns: int) -> int:
-        """How many messages of `channels` were logged before `stop_ns`, by the index for all but the last blocks.
-
-        The messages of a damaged block that has an index are counted, so that the later ones keep their numbers.
-        """
-        wanted, total = frozenset(channels), 0
-        for block in self._blocks:
-            if block.first_ns >= stop_ns or not wanted & block.channels:
-                continue
-            if block.last_ns < stop_ns:
-                total += sum(block.counts.get(channel, 0) for channel in wanted)
-            else:
-                total += sum(1 for _ in self._select(block, wanted, None, stop_ns))
-        return total
 
 
 class _Codecs(threading.local):
