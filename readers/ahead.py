@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import os
 import time
-from collections import deque
 from collections.abc import Callable, Iterable
 from concurrent.futures import Future, ThreadPoolExecutor, wait
 from functools import lru_cache
@@ -47,7 +46,8 @@ class Ahead(Generic[Key, Value]):
         running: set[Future[Any]] | None = None,
     ) -> None:
         self._load = load
-        self._coming = deque(blocks)
+        self._coming = iter(blocks)
+        self._next = next(self._coming, None)
         self._begun: dict[Key, tuple[Future[Value], int]] = {}
         self._pause_s = pause_s
         self._running = set[Future[Any]]() if running is None else running
@@ -57,7 +57,7 @@ class Ahead(Generic[Key, Value]):
         """The result for `key`. From the second key on the next ones are begun: one alone is no reading through."""
         future = self._begun.pop(key, (None, 0))[0]
         if future is None:
-            while self._coming and self._coming.popleft()[0] is not key:
+            while (passed := self._advance()) is not None and passed[0] is not key:
                 pass
         if time.perf_counter() - self._given_s >= self._pause_s:
             self._begin()
@@ -65,12 +65,17 @@ class Ahead(Generic[Key, Value]):
         self._given_s = time.perf_counter()
         return value
 
+    def _advance(self) -> tuple[Key, int] | None:
+        """Pass over the next block, None after the last."""
+        passed, self._next = self._next, next(self._coming, None)
+        return passed
+
     def _begin(self) -> None:
-        while self._coming and len(self._begun) < AHEAD_BLOCKS:
-            key, size = self._coming[0]
+        while self._next is not None and len(self._begun) < AHEAD_BLOCKS:
+            key, size = self._next
             if self._begun and size + sum(begun for _, begun in self._begun.values()) > AHEAD_BYTES:
                 return
-            self._coming.popleft()
+            self._advance()
             future = _threads().submit(self._load, key)
             self._running.add(future)
             future.add_done_callback(self._running.discard)
@@ -78,7 +83,7 @@ class Ahead(Generic[Key, Value]):
 
     def stop(self) -> None:
         """Unpack nothing more, and wait for what is being unpacked: afterwards nobody reads the file."""
-        self._coming.clear()
+        self._coming, self._next = iter(()), None
         begun = [future for future, _ in self._begun.values()]
         self._begun.clear()
         wait([future for future in begun if not future.cancel()])

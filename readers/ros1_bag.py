@@ -16,7 +16,7 @@ from collections import Counter
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from concurrent.futures import Future
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, lru_cache, partial
 from itertools import islice, permutations
 from operator import gt, itemgetter
 from pathlib import Path
@@ -42,6 +42,7 @@ _CHUNK_MARK = b"\x04\0\0\0op=\x05"
 _MESSAGE_MARK = b"\x04\0\0\0op=\x02"
 _LONGEST_CHUNK_HEADER = 80
 _LONGEST_HEADER = 1 << 20
+_SHORT_HEADER = 64
 KEPT_CHUNKS, KEPT_CHUNK_BYTES = 4, 1 << 21
 _COMPRESSIONS = (b"none", b"bz2", b"lz4")
 _END_OF_TIME = 1 << 63
@@ -89,22 +90,30 @@ class Record(NamedTuple):
 
 
 def fields_of(raw: Buffer) -> Fields:
-    """The named fields of a header.
+    """The named fields of a header, which are not to be changed.
 
     Raises:
         TornError: they do not fill it.
     """
-    raw, at, found = bytes(raw), 0, {}
-    while at < len(raw):
-        if at + 4 > len(raw):
+    raw = bytes(raw)
+    return _short_fields(raw) if len(raw) <= _SHORT_HEADER else _fields(raw)
+
+
+def _fields(raw: bytes) -> Fields:
+    at, end, found = 0, len(raw), {}
+    while at < end:
+        if at + 4 > end:
             raise TornError
         (length,) = _U32.unpack_from(raw, at)
         at += 4 + length
         name, separator, value = raw[at - length : at].partition(b"=")
-        if at > len(raw) or not separator:
+        if at > end or not separator:
             raise TornError
         found[name] = value
     return found
+
+
+_short_fields = lru_cache(maxsize=4096)(_fields)  # most headers of index records come again with every chunk
 
 
 def record_at(data: memoryview, offset: int) -> Record:
@@ -131,73 +140,82 @@ def record_at(data: memoryview, offset: int) -> Record:
 # ------------------------------------------------------------------------------ message records
 
 
-_FIELDS = {
-    b"op": ("8s", b"\x04\0\0\0op=\x02"),
-    b"conn": ("9sI", b"\x09\0\0\0conn="),
-    b"time": ("9sQ", b"\x0d\0\0\0time="),
+_MARKS = {
+    b"op": b"\x04\0\0\0op=\x02",
+    b"conn": b"\x09\0\0\0conn=",
+    b"time": b"\x0d\0\0\0time=",
 }
+_VALUES = {b"op": "", b"conn": "I", b"time": "Q"}
 _HEADER_BYTES = 38
 
 
 class _Layout(NamedTuple):
     """A message record up to its data, with the header's fields in one order, for one look at all of it.
 
-    `marks` takes what is `fixed` out of what `form` unpacks, and `values` the connection, time and length of the data.
+    `form` unpacks the marks before the first value, that value, the marks before the second one, that value, the marks
+    behind it, and the length of the data. `time_first` tells which value is the time, the other one is the connection.
     """
 
     form: struct.Struct
-    marks: itemgetter[Any]
-    fixed: tuple[Any, ...]
-    values: itemgetter[Any]
+    marks: tuple[bytes, bytes, bytes]
+    time_first: bool
 
     @classmethod
     def of(cls, order: tuple[bytes, ...]) -> _Layout:
         """The layout with the fields in that order."""
-        form = struct.Struct("<I" + "".join(_FIELDS[name][0] for name in order) + "I")
-        marks, place = {}, 1
+        marks, values = [_U32.pack(_HEADER_BYTES)], [""]
         for name in order:
-            marks[name] = place
-            place += 1 if name == b"op" else 2
-        fixed = (_HEADER_BYTES, *(_FIELDS[name][1] for name in order))
-        return cls(form, itemgetter(0, *marks.values()), fixed, itemgetter(marks[b"conn"] + 1, marks[b"time"] + 1, -1))
+            marks[-1] += _MARKS[name]
+            if _VALUES[name]:
+                values[-1] = _VALUES[name]
+                marks.append(b"")
+                values.append("")
+        form = struct.Struct(
+            "<" + "".join(f"{len(mark)}s{value}" for mark, value in zip(marks, values, strict=True)) + "I"
+        )
+        before, between, behind = marks
+        return cls(form, (before, between, behind), values[0] == "Q")
 
 
-_LAYOUTS = [_Layout.of(order) for order in permutations(_FIELDS)]
+_LAYOUTS = [_Layout.of(order) for order in permutations(_MARKS)]
 
 
 def layout_at(data: memoryview, at: int) -> _Layout | None:
     """The layout of the message record at `at`; None if there is none such."""
     if at + _HEADER_BYTES + 8 > len(data):
         return None
-    return next((one for one in _LAYOUTS if one.marks(one.form.unpack_from(data, at)) == one.fixed), None)
+    return next((one for one in _LAYOUTS if one.form.unpack_from(data, at)[:5:2] == one.marks), None)
 
 
 Item = tuple[int, int, memoryview] | Record
 
 
 class Walk:
-    """The records of a chunk one after the other.
+    """The records of a chunk one after the other, from `start` on.
 
-    `torn` tells afterwards where they broke off, -1 if nowhere, and `last` where the record before that begins.
+    Attributes:
+        items: of a message its connection, time in ns and data; a connection's record as it is.
+        torn: where they break off, -1 if nowhere.
+        last: where the last record begins, -1 if there is none.
     """
 
     def __init__(self, data: memoryview, start: int = 0) -> None:
-        self.data, self.start = data, start
+        self.data = data
+        self.items: list[Item] = []
         self.torn = self.last = -1
-
-    def __iter__(self) -> Iterator[Item]:
-        """Of a message its connection, time in ns and data; a connection's record as it is."""
-        data, at, end = self.data, self.start, len(self.data)
+        add, at, end, last = self.items.append, start, len(data), -1
         last_head = end - _HEADER_BYTES - 8
-        form, marks, fixed, values = _LAYOUTS[0]
+        form, marks, time_first = _LAYOUTS[0]
         while at < end:
             head = form.unpack_from(data, at) if at <= last_head else ()
-            if head and marks(head) != fixed:
+            if head[:5:2] != marks:
                 layout = layout_at(data, at)
-                head = layout.form.unpack_from(data, at) if layout else ()
-                form, marks, fixed, values = layout or _LAYOUTS[0]
+                form, marks, time_first = layout or _LAYOUTS[0]
+                head = form.unpack_from(data, at) if layout else ()
             if head:
-                number, time, length = values(head)
+                _, number, _, time, _, length = head
+                if time_first:
+                    number, time = time, number
                 start = at + _HEADER_BYTES + 8
                 stop = start + length
                 item: Item = (number, (time & 0xFFFFFFFF) * 1_000_000_000 + (time >> 32), data[start:stop])
@@ -208,9 +226,9 @@ class Walk:
                     break
             if stop > end:
                 break
-            self.last, at = at, stop
-            yield item
-        self.torn = at if at < end else -1
+            last, at = at, stop
+            add(item)
+        self.last, self.torn = last, at if at < end else -1
 
 
 def _any_record(data: memoryview, at: int) -> tuple[Item, int]:
@@ -270,25 +288,29 @@ class Chunk:
 
 
 class ChunkIndex(NamedTuple):
-    """The index behind a chunk: by connection the log times (ns) of its messages, and the places of all.
+    """The index behind a chunk: its entries by connection; `complete` where another record follows it."""
 
-    `complete` where another record follows it.
-    """
-
-    times_ns: dict[int, NDArray[np.uint64]]
-    places: list[int]
+    entries: dict[int, NDArray[np.void]]
     complete: bool
+
+    @property
+    def places(self) -> list[int]:
+        """Where the messages begin in the chunk."""
+        return [place for entries in self.entries.values() for place in entries["place"].tolist()]
 
     @property
     def spans(self) -> dict[int, Span]:
         """What the chunk holds by connection."""
-        return {number: Span.of(times) for number, times in self.times_ns.items() if len(times)}
+        return {
+            number: Span.of(entries["seconds"] * _SECOND_NS + entries["rest"])
+            for number, entries in self.entries.items()
+            if len(entries)
+        }
 
 
 def index_behind(data: memoryview, chunk: Record) -> ChunkIndex:
     """The index records behind a chunk, as far as they are whole."""
-    times: dict[int, NDArray[np.uint64]] = {}
-    places: list[int] = []
+    entries: dict[int, NDArray[np.void]] = {}
     at, complete = chunk.stop, False
     try:
         while at < len(data):
@@ -296,15 +318,13 @@ def index_behind(data: memoryview, chunk: Record) -> ChunkIndex:
             complete = record.operation in (_CHUNK, _CONNECTION, _CHUNK_INFO)
             if record.operation != _INDEX or record.stop > len(data):
                 break
-            entries = np.frombuffer(data[record.start : record.stop], _ENTRY)
-            found = entries["seconds"] * _SECOND_NS + entries["rest"]
+            found = np.frombuffer(data[record.start : record.stop], _ENTRY)
             number = record.u32(b"conn")
-            times[number] = np.concatenate([times[number], found]) if number in times else found
-            places += entries["place"].tolist()
+            entries[number] = np.concatenate([entries[number], found]) if number in entries else found
             at = record.stop
     except (TornError, ValueError):
         pass
-    return ChunkIndex(times, places, complete)
+    return ChunkIndex(entries, complete)
 
 
 class _ChunkInfo(NamedTuple):
@@ -581,7 +601,7 @@ class Ros1Log(MessageLog):
         channel_of, new = self._by_id.get, tuple.__new__
         while at >= 0:
             walk = Walk(data, at)
-            items = list(walk)
+            items = walk.items
             if walk.torn >= 0:
                 broken = "the records of a chunk break off"
                 at = self._after_break(chunk, walk, items)
@@ -643,24 +663,30 @@ class Ros1Log(MessageLog):
     def sources(
         self, channels: Collection[Channel], start_ns: int | None = None, stop_ns: int | None = None
     ) -> Iterable[Source]:
-        """One source a chunk that holds one of the channels and overlaps the range."""
+        """One source a chunk that holds one of the channels and overlaps the range, see `MessageLog.sources`."""
         wanted = frozenset(channels)
         numbers = [number for number, channel in self._by_id.items() if channel in wanted]
-        chosen = []
-        for chunk in self._chunks:
-            spans = [chunk.spans[number] for number in numbers if number in chunk.spans]
-            if any(
-                (start_ns is None or span.last_ns >= start_ns) and (stop_ns is None or span.first_ns < stop_ns)
-                for span in spans
-            ):
-                chosen.append(chunk)
-        packed = [(chunk, chunk.record.u32(b"size")) for chunk in chosen if chunk.packed]
-        slow = any(chunk.record.fields[b"compression"] == b"bz2" for chunk, _ in packed)
-        ahead = Ahead(self._unpacked, packed, 0.0 if slow else WORTH_A_THREAD_S, self._running)
+
+        def chosen() -> Iterator[Chunk]:
+            for chunk in self._chunks:
+                spans = [chunk.spans[number] for number in numbers if number in chunk.spans]
+                if any(
+                    (start_ns is None or span.last_ns >= start_ns) and (stop_ns is None or span.first_ns < stop_ns)
+                    for span in spans
+                ):
+                    yield chunk
+
+        packed = ((chunk, chunk.record.u32(b"size")) for chunk in chosen() if chunk.packed)
+        ahead = Ahead(self._unpacked, packed, 0.0 if self._slow else WORTH_A_THREAD_S, self._running)
         low, high = start_ns or 0, stop_ns if stop_ns is not None else _END_OF_TIME
-        for chunk in chosen:
+        for chunk in chosen():
             select = partial(self._select, chunk, wanted, low, high, ahead)
             yield Source(chunk.first_ns, select, chunk.last_ns)
+
+    @cached_property
+    def _slow(self) -> bool:
+        """Whether unpacking takes so long that it is worth a thread in any case."""
+        return any(chunk.record.fields[b"compression"] == b"bz2" for chunk in self._chunks)
 
     def _select(
         self, chunk: Chunk, wanted: frozenset[Channel], low: int, high: int, ahead: Ahead[Chunk, Buffer]
