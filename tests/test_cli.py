@@ -17,6 +17,7 @@ import pytest
 
 import readers.clock
 import workbench.cli
+import workbench.opening
 import workbench.session
 import workbench.settings
 from readers.streams import Fact, StreamKind, WorkbenchError
@@ -34,7 +35,7 @@ SECOND = 1_000_000_000
 @pytest.fixture
 def toys(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Path]:
     """The toys in place of readers, writers and estimators; a folder to work in."""
-    monkeypatch.setattr(workbench.session, "open_any", toy_session.open_toy)
+    monkeypatch.setattr(workbench.opening, "open_any", toy_session.open_toy)
     monkeypatch.setattr(workbench.session, "rerun_writers", lambda: toy_session.WRITERS)
     monkeypatch.setattr(workbench.settings, "BUILT_IN", {"toy": lambda: toy_session.WALKER})
     monkeypatch.setattr(TextLog, "made", [])
@@ -264,7 +265,7 @@ def test_several_image_streams_ask_for_a_choice(toys: Path, shell: Shell, monkey
     samples = [image(START + k, stream=s) for k in range(3) for s in ("/left", "/right")]
     two = ToyMission(kinds={"/left": StreamKind.IMAGE, "/right": StreamKind.IMAGE})
     two._samples = samples
-    monkeypatch.setattr(workbench.session, "open_any", lambda path, options: two)
+    monkeypatch.setattr(workbench.opening, "open_any", lambda path, options: two)
     assert "several image streams: /left, /right; choose one with --image" in shell.replay("two.log").error
     assert shell.replay("two.log", "--image", "/right").status == 0
 
@@ -312,7 +313,7 @@ def test_the_z_of_a_pose_can_be_the_height(toys: Path, shell: Shell) -> None:
 
 def test_a_calibration_for_another_size_is_not_used(toys: Path, shell: Shell, monkeypatch: pytest.MonkeyPatch) -> None:
     other = ToyMission(camera=toy_session.calibrated(width_px=640, height_px=480))
-    monkeypatch.setattr(workbench.session, "open_any", lambda path, options: other)
+    monkeypatch.setattr(workbench.opening, "open_any", lambda path, options: other)
     values = shell.replay("other.log", "--json").json
     assert values["unit"] == "px·m"
     assert "640 x 480 px, but the images are 4 x 3 px" in values["notes"][0]
@@ -369,7 +370,7 @@ def test_damaged_images_are_verdicts_events_and_facts(
 ) -> None:
     mission = ToyMission()
     mission._samples = [image(s.t_ns, damaged=k % 4 == 2) for k, s in enumerate(mission._samples[2::3])]
-    monkeypatch.setattr(workbench.session, "open_any", lambda path, options: mission)
+    monkeypatch.setattr(workbench.opening, "open_any", lambda path, options: mission)
     values = shell.replay("spots.log", "--json", "--reference", "none", "--height", "none").json
     assert values["verdicts"]["UNDECODABLE"] == 10
     assert any("25 % of the frames UNDECODABLE" in sentence for sentence in values["suitability"])

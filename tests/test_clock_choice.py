@@ -14,7 +14,8 @@ from readers.log_recording import LogRecording
 from readers.message_log import Channel, Message
 from readers.streams import Clock, ReadOptions, Sample, ScalarSample, StreamError
 from workbench.cli import main
-from workbench.session import Request, open_any, run
+from workbench.opening import open_any
+from workbench.session import Request, run
 
 SENT_LATE = 3 * MS
 

@@ -35,8 +35,9 @@ from readers.streams import (
     TrackSample,
 )
 from workbench import inputs, scenarios
+from workbench.opening import open_any
 from workbench.rrd import read_steps
-from workbench.session import Request, open_any, run
+from workbench.session import Request, run
 from workbench.settings import SettingsError
 from workbench.writers import write
 

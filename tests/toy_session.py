@@ -15,6 +15,7 @@ from typing import Any
 
 import numpy as np
 
+import workbench.opening
 import workbench.session
 import workbench.settings
 from pipelines.estimator import Step
@@ -203,7 +204,7 @@ def open_toy(path: Path, options: ReadOptions) -> ToyMission:
 
 def install() -> None:
     """Put the toys in place of the real parts, for good."""
-    workbench.session.open_any = open_toy
+    workbench.opening.open_any = open_toy
     workbench.session.rerun_writers = lambda: WRITERS
     workbench.settings.BUILT_IN = {"toy": lambda: WALKER}
 

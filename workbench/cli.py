@@ -155,7 +155,7 @@ def inspect(
     no_cache: NoCache = False,
 ) -> None:
     """Show what is in a recording: streams, cameras, damage, and what is odd about its clocks."""
-    from workbench.session import open_any
+    from workbench.opening import open_any
 
     options = _options(
         rate,
@@ -368,8 +368,9 @@ def recover(
     leaves it readable. Exit status: 0 nothing was damaged, 3 something was lost, 2 nothing can be read.
     """
     from workbench import loss_report
+    from workbench.opening import open_any
+    from workbench.progress import Progress
     from workbench.recovery import recover as write
-    from workbench.session import Progress, open_any
 
     options = _options(None, None, "auto", None, msg=msg, distribution=distro, cache=not no_cache)
     with open_any(path, options) as recording, Bar(out.name, "message") as bar:
@@ -710,7 +711,7 @@ def _write_mission(
     streams: Sequence[str] | None,
     as_json: bool,
 ) -> None:
-    from workbench.session import Progress
+    from workbench.progress import Progress
     from workbench.writers import write
 
     form: Any = None if images is None else _one_of(images, ("jpeg", "png", "stored"), "--images")
@@ -834,7 +835,8 @@ def sync(
     changes: turns, or starts and stops. Exit status 3 where no offset could be told.
     """
     from readers.streams import StreamError
-    from workbench.session import Progress, open_any
+    from workbench.opening import open_any
+    from workbench.progress import Progress
     from workbench.sync import draw
     from workbench.sync import sync as estimated
 

@@ -230,8 +230,8 @@ def evaluate(
     The folder gets coverage.rrd (for view), evaluation.html and evaluation.json.
     """
     from readers.streams import ReadOptions
+    from workbench.opening import open_any
     from workbench.patrol import areas, evaluating, reporting, saved
-    from workbench.session import open_any
     from workbench.settings import SettingsError
 
     if plan is not None and area is not None:

@@ -48,8 +48,9 @@ from readers.streams import (
     StreamError,
     StreamInfo,
 )
-from workbench import inputs, loss_report, manifest, range_inputs, visual_inputs
+from workbench import inputs, loss_report, manifest, opening, range_inputs, visual_inputs
 from workbench.checkpoints import CHECKPOINT_FRAMES, CheckpointError, CheckpointWriter
+from workbench.progress import Progress
 from workbench.range_account import RangeAccount
 from workbench.range_smoothing import Smoothing
 from workbench.settings import Plugin, Resolved, SettingsError, plugin, resolve, settings_values, to_toml
@@ -106,15 +107,6 @@ class Outcome:
     run_file: Path
     sensors_file: Path
     summary: dict[str, Any]
-
-
-@dataclass(frozen=True, slots=True)
-class Progress:
-    """How far a replay is: frames done, frames in all (None if unknown), sensor time of the last one."""
-
-    done: int
-    total: int | None
-    t_ns: int
 
 
 # -------------------------------------------------------------------------------- writers
@@ -200,22 +192,6 @@ class Interrupt:
 # -------------------------------------------------------------------------------- session
 
 
-def open_any(path: Path, options: ReadOptions) -> Recording:
-    """Open a recording of any format that a reader knows, or the mission of a scenario.
-
-    Raises:
-        RecordingError: no reader can use it.
-        SettingsError: it is a scenario that cannot be.
-    """
-    from readers import open_recording
-    from readers.adjusted import adjusted
-    from workbench.scenarios import is_scenario, open_scenario
-
-    if is_scenario(path):
-        return adjusted(open_scenario(path), options)
-    return open_recording(path, options)
-
-
 def run(
     request: Request,
     *,
@@ -245,7 +221,7 @@ def run(
         raise SettingsError(f"--smooth is for ranges, not for {request.estimator}: leave it out, or take -e range")
     if request.stride < 1:
         raise SettingsError(f"--stride {request.stride}: must be 1 or more")
-    with recording or open_any(request.path, request.options) as opened:
+    with recording or opening.open_any(request.path, request.options) as opened:
         session = _prepare(request, opened, estimator, resolved, name, preset)
         if on_warnings is not None and (warnings := [*opened.cache_troubles, *session.clock_warnings()]):
             on_warnings(warnings)

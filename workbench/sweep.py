@@ -26,7 +26,8 @@ from typing import TYPE_CHECKING, Any
 from readers.streams import RecordingError, WorkbenchError
 from workbench import inputs
 from workbench.metrics import metrics
-from workbench.session import Request, open_any, run
+from workbench.opening import open_any
+from workbench.session import Request, run
 from workbench.settings import SettingsError, parse_override, plugin, resolve, settings_values
 from workbench.summary import without_nan
 

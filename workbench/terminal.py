@@ -12,7 +12,7 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any, Self
 
 if TYPE_CHECKING:
-    from workbench.session import Progress
+    from workbench.progress import Progress
 
 REFUSED, IN_PART, NOT_MET, INTERRUPTED, FAULT = 2, 3, 4, 130, 1
 EPOCH_NS = 100_000_000_000_000_000
@@ -142,7 +142,7 @@ class Bars:
 
     def __call__(self, title: str, done: int, total: int) -> None:
         """Show how far the thing of that title is."""
-        from workbench.session import Progress
+        from workbench.progress import Progress
 
         if self._bar is None or title != self._title:
             self.__exit__(None, None, None)
