@@ -6,6 +6,7 @@ findings = diagnose(Case.of_run(open_run("results/mission")))
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import math
 from collections.abc import Iterable
 
@@ -19,16 +20,21 @@ GRAVE_SHARE = 0.01
 """A finding whose frames add more than this share of the path to the end-point error is an error, whatever its rule."""
 
 
+_MODULES = {"correlation": "path_rules", "range": "range_rules", "semidirect": "visual_rules", "ptam": "visual_rules"}
+"""Where the rules for each estimator are; they are imported for its runs alone."""
+
+
 def all_rules() -> tuple[Rule, ...]:
     """Every rule that there is."""
-    from workbench.diagnosis import path_rules, range_rules, visual_rules
-
-    return (*path_rules.RULES, *range_rules.RULES, *visual_rules.RULES)
+    return tuple(rule for estimator in _MODULES for rule in rules_of(estimator))
 
 
 def rules_of(estimator: str) -> tuple[Rule, ...]:
-    """The rules for runs of one estimator."""
-    return tuple(rule for rule in all_rules() if rule.estimator == estimator)
+    """The rules for runs of one estimator; none for one that has none."""
+    if estimator not in _MODULES:
+        return ()
+    rules: tuple[Rule, ...] = importlib.import_module(f"{__name__}.{_MODULES[estimator]}").RULES
+    return tuple(rule for rule in rules if rule.estimator == estimator)
 
 
 def diagnose(case: Case, rules: Iterable[Rule] | None = None) -> list[Finding]:
