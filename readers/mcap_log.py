@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import mmap
 import time
-from collections import OrderedDict
+from collections import Counter, OrderedDict
 from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -49,7 +49,7 @@ from readers.mcap_records import (
 )
 from readers.mcap_scan import Scan
 from readers.message_log import Block, Channel, IndexedLog, Message, Source, crc32
-from readers.salvage import Cause, Loss, Tally
+from readers.salvage import Cause, Loss, Tally, lost_by_topic, withheld_by_topic
 from readers.streams import RecordingError
 
 READ_AHEAD = 2
@@ -312,7 +312,7 @@ class McapLog(IndexedLog):
 
     def _report_block(self, block: McapBlock, unpacked: Unpacked) -> None:
         for what, fault in unpacked.faults:
-            counts = {channel.topic: Tally(withheld=count) for channel, count in block.counts.items()}
+            counts = withheld_by_topic((channel.topic, count) for channel, count in block.counts.items())
             span = (block.offset, block.offset + block.size if unpacked.withheld else block.offset)
             times = (block.first_ns, block.last_ns)
             self.report(what, fault, *span, counts if unpacked.withheld else None, times)
@@ -403,9 +403,21 @@ class McapLog(IndexedLog):
         if walked.fault and not block.torn:
             self.report(Cause.CUT, walked.fault, *span)
         if len(found) != expected and not block.torn:
-            self.report(Cause.COUNT, f"a chunk's index lists {expected} messages and {len(found)} are there", *span)
+            self._report_count(block)
         if found and (found[0].log_ns < block.first_ns or found[-1].log_ns > block.last_ns):
             self.report(Cause.ORDER, "a chunk holds messages of other times than it states", *span)
+
+    def _report_count(self, block: McapBlock) -> None:
+        """Report how the messages of a block differ in number from its index, of all channels, whichever are read."""
+        segment = block.segment
+        found = Counter(
+            message.channel for message in walk(self.unpack(block).records, segment, segment.channels).messages
+        )
+        listed = Counter(block.counts)
+        lost = lost_by_topic((channel.topic, count) for channel, count in (listed - found).items())
+        text = f"a chunk's index lists {listed.total()} messages and {found.total()} are there"
+        stop = block.offset + block.size if lost else block.offset
+        self.report(Cause.COUNT, text, block.offset, stop, lost, (block.first_ns, block.last_ns))
 
     def sources(
         self, channels: Collection[Channel], start_ns: int | None = None, stop_ns: int | None = None
@@ -438,7 +450,7 @@ class McapLog(IndexedLog):
             self._blocks.remove(block)
             for channel, count in block.counts.items():
                 channel.count -= count
-            counts = {channel.topic: Tally(withheld=count) for channel, count in block.counts.items()}
+            counts = withheld_by_topic((channel.topic, count) for channel, count in block.counts.items())
             text = f"{sum(block.counts.values())} messages outside of chunks, where the others are, are left out"
             span = (block.offset, block.offset + block.size)
             self.report(Cause.CHECKSUM, text, *span, counts, (block.first_ns, block.last_ns))
