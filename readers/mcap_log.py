@@ -77,6 +77,7 @@ class McapLog(IndexedLog):
         self.statistics: Statistics | None = None
         self._unpacked: OrderedDict[int, Future[Unpacked]] = OrderedDict()
         self._checked: set[int] = set()
+        self._first: dict[tuple[int, bool], McapBlock] = {}  # by segment: the first chunk with, and without a checksum
         self.told: set[int] = set()
         self._thread: ThreadPoolExecutor | None = None
         self._given_s = 0.0
@@ -351,10 +352,22 @@ class McapLog(IndexedLog):
         while len(self._unpacked) > kept:
             self._unpacked.popitem(last=False)
         self._given_s = time.perf_counter()
+        self._judge_checksum(block, unpacked)
         if unpacked.faults and (unpacked.withheld or block.offset not in self.told):
             self.told.add(block.offset)
             self._report_block(block, unpacked)
         return unpacked
+
+    def _judge_checksum(self, block: McapBlock, unpacked: Unpacked) -> None:
+        """Report the first chunk that was met without a checksum in a file that has others with one."""
+        if not block.chunk or block.torn or unpacked.withheld or not unpacked.records:
+            return
+        start = block.segment.start
+        self._first.setdefault((start, bool(unpacked.crc)), block)
+        if (start, True) in self._first and (bare := self._first.get((start, False))) is not None:
+            count = sum(bare.counts.values())
+            text = f"a chunk has no checksum though others have; its {count} messages are read without a checksum"
+            self.report(Cause.CHECKSUM, text, bare.offset, bare.offset, None, (bare.first_ns, bare.last_ns))
 
     def _begin(self, block: McapBlock) -> bool:
         """Unpack a block in a thread, where it is worth one; whether that was begun, now or earlier."""

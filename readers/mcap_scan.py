@@ -160,7 +160,8 @@ class Scan:
 
     def _points_into_file(self, opcode: int, body: memoryview) -> bool:
         """Whether a record that belongs into the summary, and lies before it, states places that can be."""
-        return sum(_TWO_U64.unpack_from(body, POINTERS[Opcode(opcode)])) <= self.size
+        place, length = _TWO_U64.unpack_from(body, POINTERS[Opcode(opcode)])
+        return int(place + length) <= self.size
 
     def _undefined(self, at: int, end: int) -> int:
         """Pass over a record of an undefined kind, which may be a defined one with a damaged first byte."""
@@ -252,6 +253,8 @@ class Scan:
         self.chunked = True
         inner = at + HEAD.size + head.stop
         if end <= self.size and inner <= end and (self.leads_on(end) or (inner == end and self._proven(at, end))):
+            if inner < end:
+                self.log.report(Cause.CUT, "a chunk's records end before it does; the rest is lost", inner, end)
             return self._block(at, end)[1]
         if inner <= self.size and (self.leads_on(inner) or self._proven(at, inner)):
             self.log.report(Cause.LIMIT, "the length of a chunk record is wrong; the chunk's own served", at, at)

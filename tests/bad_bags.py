@@ -173,6 +173,46 @@ def _hostile_topic(data: bytearray) -> None:
         data[mark.start() + 6 : mark.end()] = b"/\x00\n\x1b["
 
 
+def _chunk_taken_out(data: bytearray) -> bytes:
+    at = chunks(data)
+    return bytes(data[: at[3]] + data[at[4] :])
+
+
+def _chunks_swapped(data: bytearray) -> bytes:
+    at = chunks(data)
+    return bytes(data[: at[3]] + data[at[4] : at[5]] + data[at[3] : at[4]] + data[at[5] :])
+
+
+def _no_head(data: bytearray) -> None:
+    at = chunks(data)[3]
+    data[at : at + 40] = bytes(40)
+
+
+def _hundred_bytes_gone(data: bytearray) -> bytes:
+    start, _ = chunk_data(data, chunks(data)[3])
+    return bytes(data[: start + 500] + data[start + 600 :])
+
+
+def _no_kind_of_connections(data: bytearray) -> bytes:
+    """Neither in the chunks nor, as there is none, in the index."""
+    return _unindexed(bytearray(bytes(data).replace(b"op=\x07", b"op=\x17")))
+
+
+def _no_topic(data: bytearray) -> bytes:
+    return _unindexed(bytearray(bytes(data).replace(b"topic=/imu", b"tobic=/imu")))
+
+
+def _stranger(data: bytearray) -> None:
+    start, _ = chunk_data(data, chunks(data)[3])
+    data[data.index(b"conn=\0\0\0\0", start) + 5] = 9
+
+
+def _index_of_a_stranger(data: bytearray) -> bytes:
+    _, stop = chunk_data(data, chunks(data)[3])
+    data[data.index(b"conn=", stop) + 5] = 9
+    return _unindexed(data)
+
+
 def joined(folder: Path) -> Path:
     path = bag(folder)
     path.write_bytes(path.read_bytes() + b"garbage after the end" * 10)
@@ -216,6 +256,17 @@ ROS1_CASES = {
     "bomb": Case(edited(_bomb, "bz2"), 215, "more than the", counted=True),
     "bomb that claims little": Case(edited(lambda d: _bomb(d, 8000), "bz2"), 215, "states 8000 bytes", counted=True),
     "hostile topic": Case(edited(_hostile_topic), 240, ""),
+    "chunk taken out": Case(edited(_chunk_taken_out), 218, "not where the index states", counted=True),
+    "chunks swapped": Case(edited(_chunks_swapped), 240, ""),
+    "chunks swapped lz4": Case(edited(_chunks_swapped, "lz4"), 240, ""),
+    "chunk without a head": Case(edited(_no_head), 240, "no record begins"),
+    "chunk without a head lz4": Case(edited(_no_head, "lz4"), 240, "no record begins"),
+    "chunk without a head bz2": Case(edited(_no_head, "bz2"), 240, "no record begins"),
+    "100 bytes gone": Case(edited(_hundred_bytes_gone), 239, "break off", counted=True),
+    "damaged kind of connections": Case(edited(_no_kind_of_connections), 240, "what is left of it served"),
+    "connection without a topic": Case(edited(_no_topic), 40, "a connection in a chunk is damaged", named=True),
+    "message of a stranger": Case(edited(_stranger), 239, "does not describe", counted=True, named=True),
+    "index of a stranger": Case(edited(_index_of_a_stranger, "lz4"), 240, "than its index states"),
     "garbage after the end": Case(joined, 240, "no record can be read"),
 }
 

@@ -518,3 +518,31 @@ def test_a_file_of_many_false_chunk_heads_takes_no_long_time(tmp_path: Path) -> 
     path.write_bytes(HEAD + head * 40_000 + bytes(1 << 20))
     _, log = read(path)
     assert log.losses
+
+
+@pytest.mark.parametrize("index", [True, False])
+def test_a_chunk_whose_checksum_is_gone_is_said_to_be_unproven(tmp_path: Path, index: bool) -> None:
+    path = tmp_path / "a.mcap"
+    log = made(path, "none", index=index)
+    for number in (0, 3):
+        path.write_bytes(patched(log, number, 9 + 24, bytes(4)))
+        found, opened = read(path)
+        assert found == log.keys
+        (loss,) = opened.losses
+        assert (loss.what, loss.start) == (Cause.CHECKSUM, log.chunks[number][0])
+        assert f"its {log.chunks[number][2]} messages are read without a checksum" in loss.text
+    bare = log.data
+    for offset, _, _ in log.chunks:
+        bare = bare[: offset + 33] + bytes(4) + bare[offset + 37 :]
+    path.write_bytes(bare)
+    assert read(path)[1].losses == []
+
+
+def test_a_chunk_that_seems_to_be_empty_is_said_to_hold_more(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    log = made(path, index=False)
+    path.write_bytes(patched(log, 3, 25, bytes(60)))
+    found, opened = read(path)
+    assert set(found) < set(log.keys)
+    offset, size, _ = log.chunks[3]
+    assert (Cause.CUT, offset + size) in {(loss.what, loss.stop) for loss in opened.losses}
