@@ -314,7 +314,8 @@ class Scan:
             self.log.report(Cause.CUT, walked.fault, start, start)
         if walked.strangers:
             text = f"{walked.strangers.total()} messages are of channels that the file does not describe"
-            self.log.report(Cause.SCHEMA, text, start, end)
+            unknown = withheld_by_topic((f"channel {number}", count) for number, count in walked.strangers.items())
+            self.log.report(Cause.SCHEMA, text, start, end, unknown)
         for message in walked.messages:
             message.channel.note(message.log_ns)
         if walked.messages:

@@ -642,7 +642,8 @@ class Ros1Log(MessageLog):
         """
         at = walk.torn
         cut = chunk.record.torn and chunk.record.stop == self._size
-        if bisect_left(places, at) == bisect_right(places, at) and walk.last >= 0 and not cut and not _is_record(walk.data, at):
+        listed = bisect_left(places, at) < bisect_right(places, at)
+        if not listed and walk.last >= 0 and not cut and not _is_record(walk.data, at):
             items.pop()
             at = walk.last
         behind = islice(places, bisect_right(places, at), None)

@@ -312,6 +312,40 @@ def write_ahead(folder: Path) -> Path:
     return _left_behind(folder, "-wal", "PRAGMA journal_mode = WAL", "PRAGMA wal_autocheckpoint = 0")
 
 
+def torn_log(change: Callable[[bytearray], Any]) -> Callable[[Path], Path]:
+    """The same, with the write-ahead log damaged: SQLite leaves out what follows, without a word."""
+
+    def make(folder: Path) -> Path:
+        path = write_ahead(folder)
+        log = path.with_name(path.name + "-wal")
+        data = bytearray(log.read_bytes())
+        result = change(data)
+        log.write_bytes(data if result is None else result)
+        return path
+
+    return make
+
+
+def _flip_in_the_middle(data: bytearray) -> None:
+    data[len(data) // 2] ^= 4
+
+
+def old_pages_in_the_log(folder: Path) -> Path:
+    """A write-ahead log that was begun anew: behind its pages lie those of the use before, which count no more."""
+    source, target = database(folder), folder / "live.db3"
+    connection = sqlite3.connect(source, isolation_level=None)
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("PRAGMA wal_autocheckpoint = 0")
+    connection.execute("UPDATE messages SET timestamp = timestamp + 1")
+    connection.execute("UPDATE messages SET timestamp = timestamp - 1")
+    connection.execute("PRAGMA wal_checkpoint")
+    connection.execute("UPDATE messages SET timestamp = timestamp WHERE id = 1")
+    shutil.copy(source, target)
+    shutil.copy(source.with_name(source.name + "-wal"), target.with_name(target.name + "-wal"))
+    connection.close()
+    return target
+
+
 def hot_journal(folder: Path) -> Path:
     """A transaction that deletes half of the rows and was not finished; the journal undoes it."""
     source, target = database(folder), folder / "live.db3"
@@ -382,6 +416,12 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
 DB3_CASES = {
     "zero length": Case(lambda folder: raw(b"")(folder).rename(folder / "a.db3"), 0, "0 bytes"),
     "half in the write-ahead log": Case(write_ahead, 240, ""),
+    "torn write-ahead log": Case(torn_log(_flip_in_the_middle), 120, "not completed or are damaged", named=True),
+    "cut write-ahead log": Case(
+        torn_log(lambda data: data[: len(data) // 2]), 120, "not completed or are damaged", named=True
+    ),
+    "garbage as write-ahead log": Case(torn_log(lambda data: b"garbage" * 999), 120, "cannot be merged", named=True),
+    "old pages in the write-ahead log": Case(old_pages_in_the_log, 240, "copied and merged"),
     "hot journal": Case(hot_journal, 240, ""),
     "8 kB of zeros": Case(pages(_zero_pages), 215, "known to be lost", counted=True),
     "false index of times": Case(pages(_false_index), 240, "the index of times differs"),
