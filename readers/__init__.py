@@ -6,7 +6,9 @@ folder, not only from its name, and imports the reader of that format when it is
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from importlib.metadata import entry_points
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -19,6 +21,7 @@ if TYPE_CHECKING:
     from readers.bag_folder import BagMetadata
     from readers.index_cache import Entry
     from readers.message_log import MessageLog
+    from readers.salvage import Loss
 
 __all__ = ["ReadOptions", "Recording", "RecordingError", "open_recording"]
 
@@ -80,10 +83,10 @@ def _open(path: Path, options: ReadOptions) -> Recording:
 def _open_file(path: Path, options: ReadOptions) -> Recording:
     from readers.log_recording import LogRecording
 
-    scratch: list[TemporaryDirectory[str]] = []
-    log = _open_log(path, scratch, _kept(path, options))
-    if log is not None:
-        return LogRecording(path, [log], options, scratch=scratch[0] if scratch else None)
+    with _scratch() as scratch:
+        log = _open_log(path, scratch, _kept(path, options))
+        if log is not None:
+            return LogRecording(path, [log], options, scratch=scratch.pop() if scratch else None)
     if (recording := _ask_plugins(path, options)) is not None:
         return recording
     if _start_of(path).startswith(MATLAB):
@@ -99,6 +102,17 @@ def _open_file(path: Path, options: ReadOptions) -> Recording:
         tried = "tried MCAP, ROS 1 bag, ROS 2 database, plug-ins and video"
         problem = f"no reader knows this file (it begins with {start}; {tried}: {error.problem})"
         raise RecordingError(path, problem, "give a .bag, .db3 or .mcap file, a folder of images or a video") from error
+
+
+@contextmanager
+def _scratch() -> Iterator[list[TemporaryDirectory[str]]]:
+    """A list for a temporary folder, which is removed at the end unless a recording has taken it out."""
+    folders: list[TemporaryDirectory[str]] = []
+    try:
+        yield folders
+    finally:
+        for folder in folders:
+            folder.cleanup()
 
 
 def _start_of(path: Path) -> bytes:
@@ -136,11 +150,16 @@ def _open_log(path: Path, scratch: list[TemporaryDirectory[str]], cached: Entry 
         return SqliteLog(path, cached)
     if start.startswith(ZSTD):
         from readers.bag_folder import unpack
+        from readers.salvage import Cause, Loss
 
+        unpacked, fault = unpack(path, scratch)
         try:
-            return _open_log(unpack(path, scratch), scratch)
+            log = _open_log(unpacked, scratch)
         except RecordingError as error:
             raise RecordingError(path, f"inside of the zstd file: {error.problem}", error.cure) from error
+        if log is not None and fault:
+            log.lose(Loss(what=Cause.CODEC, text=f"the file is packed and {fault}; what could be unpacked is read"))
+        return log
     for magic, (problem, cure) in REFUSED.items():
         if start.startswith(magic):
             raise RecordingError(path, problem, cure)
@@ -182,31 +201,39 @@ def _open_bag_folder(path: Path, options: ReadOptions) -> Recording:
 
     files = _storage_files(path)
     metadata = read_metadata(path)
-    notes = list(metadata.remarks)
+    notes, losses = list(metadata.remarks), []
     if metadata.files is None:
         return _open_parts(path, files, options, "ROS 2 bag", notes)
     found = [path / name for name in metadata.files if (path / name) in files]
     missing = [name for name in metadata.files if (path / name) not in files]
     if not found:
         raise RecordingError(path, f"the files of the bag are missing ({', '.join(missing)})", "copy the whole folder")
-    notes += [f"The bag's file {name} is missing; the others are read." for name in missing]
+    losses = [_gone(f"the bag's file {name} is missing; the others are read") for name in missing]
     extra = sorted(file.name for file in files if file not in found)
     notes += [f"{name} is not listed in metadata.yaml and was not read." for name in extra]
-    return _join(path, found, options, "ROS 2 bag", notes, metadata)
+    return _join(path, found, options, "ROS 2 bag", notes, metadata, losses)
 
 
 def _open_parts(
     path: Path, files: Sequence[Path], options: ReadOptions, form: str, notes: Sequence[str] = ()
 ) -> Recording:
     """Take files without a list of them for one log, if their names differ in numbers only."""
-    from readers.bag_folder import natural_key
+    from readers.bag_folder import missing_numbers, natural_key
 
     files = sorted(files, key=lambda file: natural_key(file.name))
     shapes = {"".join(part for number, part in natural_key(file.name) if number < 0) for file in files}
     if len(shapes) > 1:
         names = ", ".join(file.name for file in files)
         raise RecordingError(path, "the folder holds several logs that are not parts of one", f"open one of {names}")
+    gaps = missing_numbers([file.name for file in files])
+    notes = [*notes, *(f"There is no {name} between the parts of the log." for name in gaps)]
     return _join(path, files, options, form, notes)
+
+
+def _gone(text: str) -> Loss:
+    from readers.salvage import Cause, Loss
+
+    return Loss(what=Cause.CUT, text=text)
 
 
 def _join(
@@ -216,46 +243,59 @@ def _join(
     form: str,
     notes: Sequence[str],
     metadata: BagMetadata | None = None,
+    losses: Sequence[Loss] = (),
 ) -> Recording:
     """One recording of several files, compared with what metadata.yaml says of its topics."""
     from readers.log_recording import LogRecording
 
     logs: list[MessageLog] = []
-    scratch: list[TemporaryDirectory[str]] = []
-    remarks = list(notes)
-    for file in files:
-        try:
-            log = _open_log(file, scratch, _kept(file, options))
-            if log is None:
-                raise RecordingError(file, "it is no file of a bag", "remove it from the folder")
-            logs.append(log)
-        except RecordingError as error:
-            if len(files) == 1:
-                raise
-            remarks.append(f"{file.name} is left out: {error.problem}.")
-    if not logs:
-        raise RecordingError(path, "no file of the bag can be read", remarks[-1])
-    if metadata is not None:
-        remarks += _compare(metadata, logs)
-    kinds = ", ".join(dict.fromkeys(log.format for log in logs))
-    whole = kinds if kinds.startswith(form) else f"{form}, {kinds}"
-    count = f", {len(logs)} files" if len(logs) > 1 else ""
-    return LogRecording(
-        path, logs, options, form=f"{whole}{count}", notes=remarks, scratch=scratch[0] if scratch else None
-    )
+    remarks, gone = list(notes), list(losses)
+    with _scratch() as scratch:
+        for file in files:
+            try:
+                log = _open_log(file, scratch, _kept(file, options))
+                if log is None:
+                    raise RecordingError(file, "it is no file of a bag", "remove it from the folder")
+                logs.append(log)
+            except RecordingError as error:
+                if len(files) == 1:
+                    raise
+                gone.append(_gone(f"{file.name} is left out: {error.problem}"))
+        if not logs:
+            raise RecordingError(
+                path, f"no file of the bag can be read ({gone[-1].text})", "copy the whole folder again"
+            )
+        if metadata is not None:
+            remarks += _other_formats(metadata, logs)
+            gone += list(_other_counts(metadata, logs, gone=bool(gone)))
+        kinds = ", ".join(dict.fromkeys(log.format for log in logs))
+        whole = kinds if kinds.startswith(form) else f"{form}, {kinds}"
+        count = f", {len(logs)} files" if len(logs) > 1 else ""
+        folder = scratch.pop() if scratch else None
+        return LogRecording(path, logs, options, form=f"{whole}{count}", notes=remarks, scratch=folder, losses=gone)
 
 
-def _compare(metadata: BagMetadata, logs: Sequence[MessageLog]) -> Iterator[str]:
-    """Where metadata.yaml and the files differ; other counts are a loss of the first file, or a lie about it."""
-    from readers.salvage import Cause, Loss
-
+def _other_formats(metadata: BagMetadata, logs: Sequence[MessageLog]) -> Iterator[str]:
+    """The topics that metadata.yaml states to be serialised in another way than their files do."""
     for topic, encoding in {channel.topic: channel.encoding for log in logs for channel in log.channels}.items():
         if (stated := metadata.formats.get(topic, encoding)) != encoding:
             yield f"{topic} is {stated} by metadata.yaml and {encoding} by its file, which was believed."
-        count = sum(channel.count for log in logs for channel in log.channels if channel.topic == topic)
+
+
+def _other_counts(metadata: BagMetadata, logs: Sequence[MessageLog], *, gone: bool) -> Iterator[Loss]:
+    """The topics of which metadata.yaml states other counts than the files hold; lost where files are `gone`."""
+    from readers.salvage import Cause, Loss, lost_by_topic
+
+    counts = Counter(dict.fromkeys(metadata.counts, 0))
+    for log in logs:
+        for channel in log.channels:
+            counts[channel.topic] += channel.count
+    gone = gone and not any(log.losses for log in logs)
+    for topic, count in counts.items():
         if (announced := metadata.counts.get(topic, count)) != count:
             words = f"metadata.yaml states {announced} messages of {topic}, and the files hold {count}"
-            logs[0].lose(Loss(what=Cause.COUNT, text=words))
+            lost = lost_by_topic([(topic, announced - count)]) if gone and announced > count else {}
+            yield Loss(what=Cause.COUNT, text=words, topics=lost)
 
 
 # ---------------------------------------------------------------------------------- plug-ins

@@ -5,6 +5,7 @@ from __future__ import annotations
 import csv
 import math
 import re
+from collections.abc import Collection
 from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from decimal import Decimal
@@ -65,13 +66,27 @@ class Table:
             raise ValueError(f"{cell!r} is not finite")
         return value
 
-    def timed(self, time_column: int, unit: str, columns: list[int]) -> tuple[NDArray[np.int64], FloatArray]:
+    def identity(self, cell: str) -> float:
+        """The number by which something is called: whole, not negative, of 32 bits.
+
+        Raises:
+            ValueError: it is none.
+        """
+        value = self.number(cell)
+        if not (0 <= value < 2**32 and value.is_integer()):
+            raise ValueError(f"{cell!r} is no number of a thing")
+        return value
+
+    def timed(
+        self, time_column: int, unit: str, columns: list[int], *, identities: Collection[int] = ()
+    ) -> tuple[NDArray[np.int64], FloatArray]:
         """Times and numbers of all rows that can be read; the others are added to `bad`.
 
         Args:
             time_column: index of the column with the times.
             unit: the times' unit.
             columns: indices of the columns with the numbers.
+            identities: those of the columns that call something by a number.
 
         Returns:
             Times in ns [n] and numbers [n, len(columns)].
@@ -79,7 +94,7 @@ class Table:
         times, values = [], []
         for line, cells in self.rows:
             try:
-                row = [self.number(cells[c]) for c in columns]
+                row = [self.identity(cells[c]) if c in identities else self.number(cells[c]) for c in columns]
                 times.append(exact_ns(self.plain(cells[time_column]), unit))
                 values.append(row)
             except (ValueError, IndexError) as error:

@@ -71,14 +71,14 @@ def _subjects(draft: Draft, file: Path) -> dict[int, int]:
         draft.note(f"{file.name} is missing: landmarks are known by their barcodes")
         return {}
     table = read_table(file)
-    return {int(barcode): int(subject) for subject, barcode in _numbers(draft, table, 2)}
+    return {int(barcode): int(subject) for subject, barcode in _numbers(draft, table, 2, identities=2)}
 
 
 def _survey(draft: Draft, file: Path) -> None:
     if not file.is_file():
         draft.note(f"{file.name} is missing: the landmarks' places are unknown")
         return
-    for subject, x, y, sigma_x, sigma_y in _numbers(draft, read_table(file), 5):
+    for subject, x, y, sigma_x, sigma_y in _numbers(draft, read_table(file), 5, identities=1):
         draft.landmarks[int(subject)] = Landmark(
             position_m=array(x, y, np.nan), sigma_m=array(sigma_x, sigma_y, np.nan)
         )
@@ -98,7 +98,7 @@ def _sightings(draft: Draft, robot: str, file: Path, subject_of: dict[int, int])
         draft.note(f"{file.name} is missing: {robot} has no measurements")
         return
     table = read_table(file)
-    times, rows = table.timed(0, "s", [1, 2, 3])
+    times, rows = table.timed(0, "s", [1, 2, 3], identities=[1])
     draft.bad_rows(table)
     codes = rows[:, 0].astype(np.int64)
     known = np.array([not subject_of or int(code) in subject_of for code in codes], dtype=bool)
@@ -124,12 +124,12 @@ def _path(draft: Draft, robot: str, file: Path) -> None:
     draft.poses(f"{robot}/reference", times, position, quat, "MRCLAM ground truth", child=robot)
 
 
-def _numbers(draft: Draft, table: Table, count: int) -> list[list[float]]:
-    """The rows of a table of numbers, those left out that hold less."""
+def _numbers(draft: Draft, table: Table, count: int, *, identities: int) -> list[list[float]]:
+    """The rows of a table of numbers, the first of which are `identities`; those left out that hold less."""
     rows = []
     for line, cells in table.rows:
         try:
-            rows.append([table.number(cells[k]) for k in range(count)])
+            rows.append([(table.identity if k < identities else table.number)(cells[k]) for k in range(count)])
         except (ValueError, IndexError) as error:
             table.bad.append((line, str(error)))
     draft.bad_rows(table)
@@ -191,13 +191,17 @@ def _loaded(file: Path) -> dict[str, Any]:
 
 
 def _check(file: Path, values: dict[str, Any]) -> None:
-    sizes = {"K": np.size(values.get("t", ())), "J": np.shape(values.get("rho_i_pj_i", ()))[-1]}
+    sizes = {"K": np.size(values.get("t", ())), "J": (0, *np.shape(values.get("rho_i_pj_i", ())))[-1]}
     for name, shape in COURSE_SHAPES.items():
-        if np.shape(values.get(name, ())) != tuple(sizes.get(str(n), n) for n in shape):
+        found = np.asarray(values.get(name, ()))
+        if found.shape != tuple(sizes.get(str(n), n) for n in shape) or found.dtype.kind not in "iuf":
             known = ", ".join(sorted(k for k in values if not k.startswith("__"))) or "none"
             problem = f"a MATLAB table without the landmark tracks of the UTIAS course ({name} is missing or misshapen)"
             cure = f"its variables are {known}; convert it to a bag or MCAP file"
             raise RecordingError(file, problem, cure)
+        if not np.all(np.isfinite(found)) or (name == "t" and not np.all((found >= 0) & (found < 2**33))):
+            problem = f"its variable {name} holds a number that is not finite, or a time that is none"
+            raise RecordingError(file, problem, "mend it in MATLAB and save it again")
 
 
 def _seen(columns: Floats) -> tuple[NDArray[np.int64], Floats]:

@@ -187,6 +187,7 @@ class LogRecording(Recording):
         form: what the whole was taken for; the format of the first file if empty.
         notes: choices made while opening.
         scratch: a temporary folder that the recording needs until it is closed.
+        losses: what is lost of the log beside what its files lost.
     """
 
     def __init__(
@@ -198,12 +199,14 @@ class LogRecording(Recording):
         form: str = "",
         notes: Sequence[str] = (),
         scratch: TemporaryDirectory[str] | None = None,
+        losses: Sequence[Loss] = (),
     ) -> None:
         self.path = path
         self.format = form or logs[0].format
         self._logs = tuple(logs)
         self._options = options
         self._scratch = scratch
+        self._losses = tuple(losses)
         self.notes = (*notes, *options.clock_notes(), *dict.fromkeys(note for log in logs for note in log.notes))
         self._topics = self._list_topics()
         listed = (info for topic in self._topics for info in topic.streams)
@@ -348,9 +351,10 @@ class LogRecording(Recording):
     @property
     def damage(self) -> tuple[Damage, ...]:
         """What of the files is damaged, as far as they were read by now."""
+        own = tuple(loss.damage for loss in self._losses)
         if len(self._logs) == 1:
-            return tuple(self._logs[0].damage)
-        return tuple(
+            return (*own, *self._logs[0].damage)
+        return own + tuple(
             Damage(what=harm.what, where=f"{log.path.name}, {harm.where}", affected=harm.affected)
             for log in self._logs
             for harm in log.damage
@@ -359,7 +363,7 @@ class LogRecording(Recording):
     @property
     def losses(self) -> tuple[Loss, ...]:
         """What of the files could not be read, as far as they were read by now, in the form that can be counted."""
-        return tuple(loss for log in self._logs for loss in log.losses)
+        return (*self._losses, *(loss for log in self._logs for loss in log.losses))
 
     @property
     def cache_troubles(self) -> tuple[str, ...]:

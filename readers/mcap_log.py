@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import mmap
 import time
-from collections import OrderedDict, deque
+from collections import Counter, OrderedDict, deque
 from collections.abc import Collection, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from functools import partial
@@ -51,7 +51,7 @@ from readers.mcap_records import (
 )
 from readers.mcap_scan import Scan
 from readers.message_log import Channel, Message, MessageLog, Source, crc32
-from readers.salvage import Cause, Loss, Tally
+from readers.salvage import Cause, Loss, Tally, lost_by_topic, withheld_by_topic
 from readers.streams import RecordingError
 
 READ_AHEAD = 2
@@ -80,6 +80,7 @@ class McapLog(MessageLog):
         self._blocks: list[McapBlock] = []
         self._unpacked: OrderedDict[int, Future[Unpacked]] = OrderedDict()
         self._checked: set[int] = set()
+        self._first: dict[tuple[int, bool], McapBlock] = {}  # by segment: the first chunk with, and without a checksum
         self.told: set[int] = set()
         self._thread: ThreadPoolExecutor | None = None
         self._given_s = 0.0
@@ -332,7 +333,7 @@ class McapLog(MessageLog):
 
     def _report_block(self, block: McapBlock, unpacked: Unpacked) -> None:
         for what, fault in unpacked.faults:
-            counts = {channel.topic: Tally(withheld=count) for channel, count in block.counts.items()}
+            counts = withheld_by_topic((channel.topic, count) for channel, count in block.counts.items())
             span = (block.offset, block.offset + block.size if unpacked.withheld else block.offset)
             times = (block.first_ns, block.last_ns)
             self.report(what, fault, *span, counts if unpacked.withheld else None, times)
@@ -371,10 +372,22 @@ class McapLog(MessageLog):
         while len(self._unpacked) > kept:
             self._unpacked.popitem(last=False)
         self._given_s = time.perf_counter()
+        self._judge_checksum(block, unpacked)
         if unpacked.faults and (unpacked.withheld or block.offset not in self.told):
             self.told.add(block.offset)
             self._report_block(block, unpacked)
         return unpacked
+
+    def _judge_checksum(self, block: McapBlock, unpacked: Unpacked) -> None:
+        """Report the first chunk that was met without a checksum in a file that has others with one."""
+        if not block.chunk or block.torn or unpacked.withheld or not unpacked.records:
+            return
+        start = block.segment.start
+        self._first.setdefault((start, bool(unpacked.crc)), block)
+        if (start, True) in self._first and (bare := self._first.get((start, False))) is not None:
+            count = sum(bare.counts.values())
+            text = f"a chunk has no checksum though others have; its {count} messages are read without a checksum"
+            self.report(Cause.CHECKSUM, text, bare.offset, bare.offset, None, (bare.first_ns, bare.last_ns))
 
     def _begin(self, block: McapBlock) -> bool:
         """Unpack a block in a thread, where it is worth one; whether that was begun, now or earlier."""
@@ -418,9 +431,21 @@ class McapLog(MessageLog):
         if walked.fault and not block.torn:
             self.report(Cause.CUT, walked.fault, *span)
         if len(found) != expected and not block.torn:
-            self.report(Cause.COUNT, f"a chunk's index lists {expected} messages and {len(found)} are there", *span)
+            self._report_count(block)
         if found and (found[0].log_ns < block.first_ns or found[-1].log_ns > block.last_ns):
             self.report(Cause.ORDER, "a chunk holds messages of other times than it states", *span)
+
+    def _report_count(self, block: McapBlock) -> None:
+        """Report how the messages of a block differ in number from its index, of all channels, whichever are read."""
+        segment = block.segment
+        found = Counter(
+            message.channel for message in walk(self.unpack(block).records, segment, segment.channels).messages
+        )
+        listed = Counter(block.counts)
+        lost = lost_by_topic((channel.topic, count) for channel, count in (listed - found).items())
+        text = f"a chunk's index lists {listed.total()} messages and {found.total()} are there"
+        stop = block.offset + block.size if lost else block.offset
+        self.report(Cause.COUNT, text, block.offset, stop, lost, (block.first_ns, block.last_ns))
 
     def sources(
         self, channels: Collection[Channel], start_ns: int | None = None, stop_ns: int | None = None
@@ -469,7 +494,7 @@ class McapLog(MessageLog):
             self._blocks.remove(block)
             for channel, count in block.counts.items():
                 channel.count -= count
-            counts = {channel.topic: Tally(withheld=count) for channel, count in block.counts.items()}
+            counts = withheld_by_topic((channel.topic, count) for channel, count in block.counts.items())
             text = f"{sum(block.counts.values())} messages outside of chunks, where the others are, are left out"
             span = (block.offset, block.offset + block.size)
             self.report(Cause.CHECKSUM, text, *span, counts, (block.first_ns, block.last_ns))

@@ -6,6 +6,7 @@ from which several records follow each other.
 
 from __future__ import annotations
 
+import struct
 from collections import Counter
 from typing import TYPE_CHECKING
 
@@ -22,24 +23,36 @@ from readers.mcap_records import (
     RecordError,
     Segment,
     Stated,
+    Statistics,
     known,
     read_channel,
     read_chunk_head,
     read_message_index,
     read_schema,
+    read_statistics,
+    unpack_chunk,
     walk,
 )
 from readers.message_log import Channel, crc32
-from readers.salvage import Cause, Tally
+from readers.salvage import Cause, lost_by_topic, withheld_by_topic
 
 if TYPE_CHECKING:
     from readers.mcap_log import McapLog
 
 RUN_BYTES = 1 << 20
-WINDOW_BYTES = 1 << 22
+WINDOW_BYTES = 1 << 14, 1 << 22
+PROOF_BYTES = 1 << 30  # what may be unpacked to prove chunks, so that no file takes long
 CHAIN = 3
 ZEROS_BYTES = 512
 UNDEFINED = range(0x10, 0x100)
+_TWO_U64 = struct.Struct("<QQ")
+POINTERS = {
+    Opcode.CHUNK_INDEX: 16,
+    Opcode.ATTACHMENT_INDEX: 0,
+    Opcode.METADATA_INDEX: 0,
+    Opcode.SUMMARY_OFFSET: 1,
+}
+"""Records of the summary: where in them the place and the length of something in the file stand."""
 _PLAUSIBLE = np.zeros(256, bool)
 _PLAUSIBLE[[*SHORTEST]] = True
 _UNREADABLE = "bytes that are no records were passed over"
@@ -66,6 +79,9 @@ class Scan:
         self.chunked = False
         self.losses = len(log.losses)
         self.magic = 0  # where the next file that was joined may begin, -1 if none does
+        self.summary = 0  # where the summary begins, 0 as long as the data go on
+        self.stated: Statistics | None = None
+        self.proofs = PROOF_BYTES
 
     def run(self) -> None:
         """Walk from the first record to the end of the file."""
@@ -95,8 +111,7 @@ class Scan:
         if opcode and self.leads_on(end) and self._take(at, opcode, end):
             return end
         if not opcode and self.view[at] in UNDEFINED and end <= self.size and self.leads_on(end):
-            self._undefined(at, end)
-            return end
+            return self._undefined(at, end)
         return self._passed_over(at)
 
     def head(self, at: int) -> tuple[int, int]:
@@ -112,13 +127,13 @@ class Scan:
             return at == self.size
         if at + HEAD.size > self.size:
             return self.view[at] in SHORTEST or self.view[at] == MAGIC[0]
-        if self.view[at] == 0:  # a power loss leaves zeros
-            zeros = self.view[at : at + ZEROS_BYTES]
-            return zeros == bytes(len(zeros))
         opcode, end = self.head(at)
-        if not opcode and self.view[at] in UNDEFINED:
-            return end <= self.size and (end == self.size or bool(self.head(end)[0]))
-        return bool(opcode) or self.view[at : at + len(MAGIC)] == MAGIC
+        if opcode or self.view[at : at + len(MAGIC)] == MAGIC:
+            return True
+        zeros = self.view[at : at + ZEROS_BYTES]
+        if zeros == bytes(len(zeros)):  # a power loss leaves zeros
+            return True
+        return end <= self.size and (end == self.size or bool(self.head(end)[0]))
 
     def _take(self, at: int, opcode: int, end: int) -> bool:
         """Take a record that is neither message nor chunk; False if it cannot be what it says."""
@@ -132,21 +147,50 @@ class Scan:
                 self.chunked = True
             elif opcode == Opcode.DATA_END:
                 self._data_end(at, body)
+                self.summary = end
+            elif opcode == Opcode.STATISTICS:
+                self.stated = read_statistics(body)
+            elif opcode == Opcode.HEADER:
+                return at == self.segment.start + len(MAGIC)
+            elif opcode in POINTERS and not self.summary:
+                return self._points_into_file(opcode, body)
         except RecordError:
             return False
         return True
 
-    def _undefined(self, at: int, end: int) -> None:
-        """A record of an undefined kind, which may be a defined one with a damaged first byte."""
+    def _points_into_file(self, opcode: int, body: memoryview) -> bool:
+        """Whether a record that belongs into the summary, and lies before it, states places that can be."""
+        place, length = _TWO_U64.unpack_from(body, POINTERS[Opcode(opcode)])
+        return int(place + length) <= self.size
+
+    def _undefined(self, at: int, end: int) -> int:
+        """Pass over a record of an undefined kind, which may be a defined one with a damaged first byte."""
+        if stop := self._disguised(at):
+            return stop
+        kind, body = self.view[at], self.view[at + HEAD.size : end]
+        message = kind == PRIVATE | Opcode.MESSAGE and int.from_bytes(body[:2], "little") in self.segment.channels
         try:
-            chunk = read_chunk_head(self.view[at + HEAD.size : end]).stop == end - at - HEAD.size
+            chunk = read_chunk_head(body).stop == len(body)
         except RecordError:
             chunk = False
-        kind = self.view[at]
-        if kind < PRIVATE or chunk:
+        if kind < PRIVATE or chunk or message:
             self.log.report(Cause.CODEC, f"a record of the unknown kind {kind:#x} was passed over", at, end)
         else:
             self.log.notes.append(f"A record of the private kind {kind:#x} was passed over.")
+        return end
+
+    def _disguised(self, at: int) -> int:
+        """Take a chunk that its checksum proves though its record's head is damaged; its end, 0 if none is there."""
+        try:
+            head = read_chunk_head(self.view[at + HEAD.size :])
+        except RecordError:
+            return 0
+        end = at + HEAD.size + head.stop
+        if end > self.size or not head.crc or not self._proven(at, end):
+            return 0
+        self.log.report(Cause.CODEC, "the head of a chunk record is damaged; the chunk's checksum served", at, at)
+        self.chunked = True
+        return self._block(at, end)[1]
 
     def _data_end(self, at: int, body: memoryview) -> None:
         """Compare the whole data section with its checksum where messages have none of their own."""
@@ -165,6 +209,7 @@ class Scan:
                 return self._passed_over(at)
             return self.size
         self.closed = True
+        self._take_statistics(at)
         end += len(MAGIC)
         if end == self.size:
             return end
@@ -176,6 +221,12 @@ class Scan:
                 return self.size
             end = found
         return self._joined(end)
+
+    def _take_statistics(self, footer: int) -> None:
+        """Believe the counts of a summary that is not where the footer states it, if its checksum proves them."""
+        crc, before_crc = FOOTER.unpack_from(self.view, footer)[4], footer + FOOTER.size - len(MAGIC) - 4
+        if self.log.statistics is None and crc and self.summary and not self.segment.start:
+            self.log.statistics = self.stated if crc32(self.view[self.summary : before_crc]) == crc else None
 
     def _joined(self, at: int) -> int:
         """Begin with another file that was joined to this one."""
@@ -190,7 +241,7 @@ class Scan:
     def _end_run(self, end: int) -> None:
         if self.run_start >= 0:
             start, self.run_start = self.run_start, -1
-            self.unchecked += self._block(start, end, chunk=False)
+            self.unchecked += self._block(start, end, chunk=False)[0]
 
     def _chunk(self, at: int, end: int) -> int:
         """Take the chunk at `at`, by its own length where that of the record leads nowhere."""
@@ -201,22 +252,41 @@ class Scan:
             return self._passed_over(at)
         self.chunked = True
         inner = at + HEAD.size + head.stop
-        if end <= self.size and inner <= end and self.leads_on(end):
-            self._block(at, end)
-            return end
-        if inner <= self.size and self.leads_on(inner):
+        if end <= self.size and inner <= end and (self.leads_on(end) or (inner == end and self._proven(at, end))):
+            if inner < end:
+                self.log.report(Cause.CUT, "a chunk's records end before it does; the rest is lost", inner, end)
+            return self._block(at, end)[1]
+        if inner <= self.size and (self.leads_on(inner) or self._proven(at, inner)):
             self.log.report(Cause.LIMIT, "the length of a chunk record is wrong; the chunk's own served", at, at)
-            self._block(at, inner)
-            return inner
+            return self._block(at, inner)[1]
         if end > self.size and inner > self.size and self.search(at + 1, chunks_only=True) < 0:
-            count = self._block(at, self.size, torn=True)
+            count, _ = self._block(at, self.size, torn=True)
             text = f"the file ends inside a chunk, {count} messages of which are read without a checksum"
             self.log.report(Cause.CUT, text, at, self.size)
             return self.size
         return self._passed_over(at)
 
-    def _block(self, start: int, end: int, *, chunk: bool = True, torn: bool = False) -> int:
-        """Read a block once, count what it holds and give it to the log; the number of its messages."""
+    def _proven(self, at: int, end: int) -> bool:
+        """Whether a chunk matches its checksum, which is more than that a record follows it."""
+        if self.proofs < 0:
+            return False
+        unpacked = unpack_chunk(self.view[at + HEAD.size : end])
+        self.proofs -= len(unpacked.records)
+        return bool(unpacked.crc) and not unpacked.withheld
+
+    def _before_overlap(self, start: int, end: int) -> int:
+        """Where a damaged chunk really ends: at a sound one that it reaches into, as it lost bytes; else at `end`.
+
+        A chunk that lies wholly inside of it may be what a message holds.
+        """
+        at = start
+        while 0 <= (at := self.search(at + 1, chunks_only=True)) < end:
+            if (following := self.head(at)[1]) > end and self._proven(at, following):
+                return at
+        return end
+
+    def _block(self, start: int, end: int, *, chunk: bool = True, torn: bool = False) -> tuple[int, int]:
+        """Read a block once, count what it holds and give it to the log; the number of its messages, and its end."""
         stated = None
         if chunk:
             head = read_chunk_head(self.view[start + HEAD.size : end])
@@ -226,15 +296,16 @@ class Scan:
         if unpacked.faults:
             self.log.told.add(start)
         if unpacked.withheld:
+            end = end if torn else self._before_overlap(start, end)
             counts, times = self._listed(end)
             self.cost.update(counts)
-            withheld = {channel.topic: Tally(withheld=count) for channel, count in counts.items()}
+            withheld = withheld_by_topic((channel.topic, count) for channel, count in counts.items())
             for what, fault in unpacked.faults:
                 self.log.report(what, fault, start, end, withheld, times)
-            return 0
+            return 0, end
         for what, fault in unpacked.faults:
             self.log.report(what, fault, start, start)
-        return self._count(start, end, block, unpacked.records, checked=bool(unpacked.crc) and not torn)
+        return self._count(start, end, block, unpacked.records, checked=bool(unpacked.crc) and not torn), end
 
     def _count(self, start: int, end: int, block: McapBlock, records: memoryview, *, checked: bool) -> int:
         self._describe_inside(start, records, sure=checked)
@@ -243,7 +314,8 @@ class Scan:
             self.log.report(Cause.CUT, walked.fault, start, start)
         if walked.strangers:
             text = f"{walked.strangers.total()} messages are of channels that the file does not describe"
-            self.log.report(Cause.SCHEMA, text, start, end)
+            unknown = withheld_by_topic((f"channel {number}", count) for number, count in walked.strangers.items())
+            self.log.report(Cause.SCHEMA, text, start, end, unknown)
         for message in walked.messages:
             message.channel.note(message.log_ns)
         if walked.messages:
@@ -286,6 +358,8 @@ class Scan:
 
     def _passed_over(self, at: int) -> int:
         """Report what lies between `at` and the next record, and go on there."""
+        if stop := self._disguised(at):
+            return stop
         found = self.search(at + 1)
         end = found if found >= 0 else self.size
         if not self.closed or found >= 0:
@@ -301,8 +375,9 @@ class Scan:
             self.magic = self.log.find(MAGIC, start)
         magic = self.magic
         stop = magic if 0 <= magic < self.size - len(MAGIC) else self.size
-        for window in range(start, stop, WINDOW_BYTES):
-            raw = np.frombuffer(self.view[window : min(window + WINDOW_BYTES + HEAD.size, stop)], np.uint8)
+        window, (width, widest) = start, WINDOW_BYTES
+        while window < stop:
+            raw = np.frombuffer(self.view[window : min(window + width + HEAD.size, stop)], np.uint8)
             if len(raw) < HEAD.size:
                 break
             short = raw[5:-3] | raw[6:-2] | raw[7:-1] | raw[8:]
@@ -310,6 +385,7 @@ class Scan:
                 at = window + int(place)
                 if (not chunks_only or self.view[at] == Opcode.CHUNK) and self._begins(at):
                     return at
+            window, width = window + width, min(4 * width, widest)
         return stop if stop < self.size else -1
 
     def _begins(self, at: int) -> bool:
@@ -390,5 +466,5 @@ class Scan:
         more = self._differences()
         if any(more.values()) or statistics.messages != found:
             text = f"the file claims {statistics.messages} messages and {found} were found"
-            lost = {channel.topic: Tally(lost=count) for channel, count in more.items() if count > 0}
+            lost = lost_by_topic((channel.topic, count) for channel, count in more.items() if count > 0)
             self.log.report(Cause.COUNT, text, -1, -1, lost if len(self.log.losses) > self.losses else None)

@@ -11,9 +11,9 @@ from __future__ import annotations
 import mmap
 import struct
 import time
-from bisect import bisect_left
+from bisect import bisect_left, bisect_right
 from collections import Counter
-from collections.abc import Collection, Iterable, Iterator, Mapping
+from collections.abc import Collection, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass
 from functools import cached_property, lru_cache, partial
@@ -28,7 +28,20 @@ from numpy.typing import NDArray
 from readers.ahead import WORTH_A_THREAD_S, Ahead, settle
 from readers.index_cache import Entry, State
 from readers.index_states import Ros1Found, put_ros1, ros1_state
-from readers.message_log import Buffer, Channel, DamagedBlockError, Message, MessageLog, Source, escaped, inflate, text
+from readers.message_log import (
+    HARMLESS_BYTES,
+    LARGEST_RATIO,
+    LARGEST_UNPACKED_BYTES,
+    Buffer,
+    Channel,
+    DamagedBlockError,
+    Message,
+    MessageLog,
+    Source,
+    escaped,
+    inflate,
+    text,
+)
 from readers.salvage import Cause, Loss, Tally
 from readers.streams import RecordingError
 
@@ -41,9 +54,11 @@ _U64 = struct.Struct("<Q")
 _CHUNK_MARK = b"\x04\0\0\0op=\x05"
 _MESSAGE_MARK = b"\x04\0\0\0op=\x02"
 _LONGEST_CHUNK_HEADER = 80
+_WINDOW_BYTES = 1 << 12
 _LONGEST_HEADER = 1 << 20
 _SHORT_HEADER = 64
 KEPT_CHUNKS, KEPT_CHUNK_BYTES = 4, 1 << 21
+_MAGICS = {b"lz4": b"\x04\x22\x4d\x18", b"bz2": b"BZh9"}
 _COMPRESSIONS = (b"none", b"bz2", b"lz4")
 _END_OF_TIME = 1 << 63
 _SECOND_NS = np.uint64(1_000_000_000)
@@ -87,6 +102,11 @@ class Record(NamedTuple):
         if len(raw) != form.size:
             raise TornError
         return int(form.unpack(raw)[0])
+
+    @property
+    def connection(self) -> bool:
+        """Whether it describes a connection, by its kind or, where that is damaged, by its fields."""
+        return self.operation == _CONNECTION or (b"conn" in self.fields and b"topic" in self.fields)
 
 
 def fields_of(raw: Buffer) -> Fields:
@@ -234,7 +254,7 @@ class Walk:
 def _any_record(data: memoryview, at: int) -> tuple[Item, int]:
     """A message or a connection whose header has other fields, or more, and where it ends."""
     record = record_at(data, at)
-    if record.operation == _CONNECTION:
+    if record.connection:
         return record, record.stop
     if record.operation != _MESSAGE:
         raise TornError
@@ -334,6 +354,11 @@ class _ChunkInfo(NamedTuple):
     last_ns: int
     counts: dict[int, int]
 
+    @property
+    def key(self) -> tuple[int, int, frozenset[tuple[int, int]]]:
+        """What two infos have in common that say the same."""
+        return self.first_ns, self.last_ns, frozenset(self.counts.items())
+
     @classmethod
     def of(cls, spans: Mapping[int, Span]) -> _ChunkInfo:
         """What it would say of a chunk with that index."""
@@ -412,9 +437,9 @@ class Ros1Log(MessageLog):
                 if record.operation == _CHUNK:
                     record = self._chunk(record)
                     chunks.append(record)
-                elif record.operation not in _BETWEEN_CHUNKS or record.stop > self._size:
+                elif record.stop > self._size or not (record.connection or record.operation in _BETWEEN_CHUNKS):
                     raise TornError
-                elif record.operation == _CONNECTION:
+                elif record.connection:
                     self._connect(record, self._data)
                 elif record.operation == _CHUNK_INFO:
                     infos[record.u64(b"chunk_pos")] = _chunk_info(record, self._data)
@@ -458,15 +483,15 @@ class Ros1Log(MessageLog):
         return self._size
 
     def _bare_messages(self, start: int, stop: int) -> Iterator[Record]:
-        """What is left of an uncompressed chunk without its head, as a torn chunk: from the first message on."""
-        mark = self._map.find(_MESSAGE_MARK, start, stop)
-        while mark >= 0:
-            for at in range(max(start, mark - _HEADER_BYTES), mark):
-                if layout_at(self._data, at):
-                    fields = {b"compression": b"none", b"size": _U32.pack(min(stop - at, 2**32 - 1))}
-                    yield Record(start, _CHUNK, fields, at, stop, torn=True)
-                    return
-            mark = self._map.find(_MESSAGE_MARK, mark + 1, stop)
+        """What is left of a chunk without its head, as a torn chunk: from its first message or the codec's mark on."""
+        found = {codec: self._map.find(magic, start, stop) for codec, magic in _MAGICS.items()}
+        found[b"none"] = start + _next_message(self._data[start:stop], 0)
+        at, compression = min(((at, codec) for codec, at in found.items() if at >= start), default=(-1, b""))
+        if at >= 0:
+            packed = stop - at
+            size = packed if compression == b"none" else max(HARMLESS_BYTES, LARGEST_RATIO * packed)
+            fields = {b"compression": compression, b"size": _U32.pack(min(size, LARGEST_UNPACKED_BYTES))}
+            yield Record(start, _CHUNK, fields, at, stop, torn=True)
 
     def _connect(self, record: Record, data: memoryview, base: int = 0) -> None:
         """Take a connection record as a channel.
@@ -475,8 +500,14 @@ class Ros1Log(MessageLog):
             TornError: its fields cannot be read.
         """
         number, described = record.u32(b"conn"), fields_of(data[record.start : record.stop])
+        topic = record.fields.get(b"topic", described.get(b"topic"))
+        if topic is None:
+            raise TornError
+        if record.operation != _CONNECTION or b"topic" not in record.fields:
+            words = f"the description of connection {number} is damaged; what is left of it served"
+            self._harm(Cause.SCHEMA, words, base or record.offset, base or record.offset)
         channel = Channel(
-            topic=escaped(text(record.fields.get(b"topic", b""))),
+            topic=escaped(text(topic)),
             type=escaped(text(described.get(b"type", b""))),
             encoding="ros1",
             schema_encoding="ros1msg",
@@ -519,13 +550,10 @@ class Ros1Log(MessageLog):
 
     def _list(self, records: list[Record], infos: dict[int, _ChunkInfo]) -> None:
         """Find out what each chunk holds: from its index where the chunk info agrees, else from itself."""
-        for record in records:
-            index = index_behind(self._data, record)
+        indexes = [index_behind(self._data, record) for record in records]
+        for record, index, info in zip(records, indexes, _infos_of(records, indexes, infos), strict=True):
             spans = index.spans
             chunk, own = Chunk(record, spans), _ChunkInfo.of(spans)
-            info = infos.pop(record.offset, None)
-            if info is None and (place := next((p for p, i in infos.items() if i == own), None)) is not None:
-                info = infos.pop(place)
             believed = info == own if info else bool(spans) and index.complete
             if record.torn or not believed or not chunk.spans.keys() <= self._by_id.keys():
                 chunk.spans = self._look_into(chunk, spans if believed else _announced(info))
@@ -598,13 +626,15 @@ class Ros1Log(MessageLog):
         found: list[Message] = []
         counts: Counter[int] = Counter()
         at, broken = 0, ""
+        places: list[int] | None = None
         channel_of, new = self._by_id.get, tuple.__new__
         while at >= 0:
             walk = Walk(data, at)
             items = walk.items
             if walk.torn >= 0:
                 broken = "the records of a chunk break off"
-                at = self._after_break(chunk, walk, items)
+                places = sorted(index_behind(self._data, chunk.record).places) if places is None else places
+                at = self._after_break(chunk, walk, items, places)
             else:
                 at = -1
             for item in items:
@@ -623,19 +653,22 @@ class Ros1Log(MessageLog):
             found.sort(key=itemgetter(0))
         return found
 
-    def _after_break(self, chunk: Chunk, walk: Walk, items: list[Item]) -> int:
-        """Where the messages of a chunk go on, by its index, behind the place where they broke off; -1 if nowhere.
+    def _after_break(self, chunk: Chunk, walk: Walk, items: list[Item], places: list[int]) -> int:
+        """Where the messages of a chunk go on behind the place where they broke off; -1 if nowhere.
 
-        A record that ends where none can begin has a wrong length: it is taken out of `items`, except where the file
-        was cut there.
+        That is the next of the sorted `places` that its index names, or, where none of them holds a message, the next
+        that does. A record that ends where none can begin has a wrong length: it is taken out of `items`, except where
+        the file was cut there.
         """
-        places = index_behind(self._data, chunk.record).places
         at = walk.torn
         cut = chunk.record.torn and chunk.record.stop == self._size
-        if at not in places and walk.last >= 0 and not cut and not _is_record(walk.data, at):
+        listed = bisect_left(places, at) < bisect_right(places, at)
+        if not listed and walk.last >= 0 and not cut and not _is_record(walk.data, at):
             items.pop()
             at = walk.last
-        return min((place for place in places if place > at), default=-1)
+        behind = islice(places, bisect_right(places, at), None)
+        indexed = next((place for place in behind if layout_at(walk.data, place)), -1)
+        return indexed if indexed >= 0 or cut else _next_message(walk.data, at + 1)
 
     def _judge_chunk(self, chunk: Chunk, counts: Counter[int], cause: Cause, broken: str, sum_ns: int = 0) -> None:
         """Compare what a chunk gave (messages by connection, sum of their times) with what it was to hold."""
@@ -643,14 +676,14 @@ class Ros1Log(MessageLog):
         missing = {number: count - counts[number] for number, count in stated.items() if count > counts[number]}
         strangers = {number: count for number, count in counts.items() if number not in self._by_id}
         moved = bool(stated) and all(span.sum_ns for span in chunk.spans.values()) and sum_ns % 2**64 != chunk.sum_ns
-        surplus = sum(count - stated.get(number, 0) for number, count in counts.items() if stated) > 0
+        surplus = sum(max(0, count - stated.get(number, 0)) for number, count in counts.items()) if stated else 0
         times = [time for span in chunk.spans.values() for time in (span.first_ns, span.last_ns) if time >= 0]
         known: dict[str, Any] = {"first_ns": min(times), "last_ns": max(times)} if times else {}
         start, stop = chunk.record.offset, chunk.record.stop
         if strangers:
             words = f"{sum(strangers.values())} messages are of connections that the bag does not describe"
             self._harm(Cause.SCHEMA, words, start, start, topics=self._tallies(strangers, withheld=True), **known)
-        if broken or missing:
+        if broken or sum(missing.values()) > surplus:
             words = broken or f"a chunk holds {sum(missing.values())} messages fewer than its index states"
             topics = self._tallies(missing, withheld=cause is Cause.CODEC)
             self._harm(cause if broken else Cause.COUNT, words, start, stop, topics=topics, **known)
@@ -719,6 +752,19 @@ class Ros1Log(MessageLog):
         self._chunks = []
 
 
+def _next_message(data: memoryview, start: int) -> int:
+    """Where the next message record at or after `start` begins, -1 if nowhere."""
+    for window in range(start, len(data), _WINDOW_BYTES):
+        raw = bytes(data[window : window + _WINDOW_BYTES + len(_MESSAGE_MARK) - 1])
+        mark = raw.find(_MESSAGE_MARK)
+        while mark >= 0:
+            for at in range(max(start, window + mark - _HEADER_BYTES), window + mark):
+                if layout_at(data, at):
+                    return at
+            mark = raw.find(_MESSAGE_MARK, mark + 1)
+    return -1
+
+
 def _is_record(data: memoryview, offset: int) -> bool:
     """Whether a record of those outside of chunks begins there."""
     try:
@@ -730,6 +776,26 @@ def _is_record(data: memoryview, offset: int) -> bool:
 def _announced(info: _ChunkInfo | None) -> dict[int, Span]:
     """What a chunk should hold if its own index cannot be believed; times are unknown."""
     return {number: Span(count, -1, -1, 0) for number, count in info.counts.items()} if info else {}
+
+
+def _infos_of(
+    records: Sequence[Record], indexes: Sequence[ChunkIndex], infos: dict[int, _ChunkInfo]
+) -> list[_ChunkInfo | None]:
+    """The chunk info of each chunk, which is taken out of `infos`: the one that agrees with its index, or its place's.
+
+    Those that agree come first, so that chunks which were moved do not take the infos of others.
+    """
+    found: list[_ChunkInfo | None] = []
+    places: dict[tuple[int, int, frozenset[tuple[int, int]]], list[int]] = {}
+    for place, info in infos.items():
+        places.setdefault(info.key, []).append(place)
+    for record, index in zip(records, indexes, strict=True):
+        agreeing = places.get(_ChunkInfo.of(index.spans).key, [])
+        found.append(None)
+        if agreeing:
+            place = agreeing.pop(agreeing.index(record.offset) if record.offset in agreeing else 0)
+            found[-1] = infos.pop(place)
+    return [info or infos.pop(record.offset, None) for record, info in zip(records, found, strict=True)]
 
 
 def _chunk_info(record: Record, data: memoryview) -> _ChunkInfo:

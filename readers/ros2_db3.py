@@ -13,10 +13,12 @@ import mmap
 import re
 import shutil
 import sqlite3
+import struct
 import time
 from collections import Counter
 from collections.abc import Collection, Iterable, Iterator
 from functools import partial
+from itertools import takewhile
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any, NamedTuple
@@ -24,13 +26,16 @@ from urllib.parse import quote
 
 from readers.index_cache import Entry
 from readers.index_states import Counted, db3_counted, db3_state
-from readers.message_log import Channel, Message, MessageLog, Source, escaped
+from readers.message_log import Channel, Message, MessageLog, Source, escaped, text
 from readers.salvage import Cause, Loss, Tally
 from readers.sqlite_pages import BrokenRowError, Pages, Row
 from readers.streams import RecordingError
 
 _FLOAT, _BLOB, _TEXT = 7, 12, 13
 _MESSAGE_COLUMNS = 4
+_LOG_HEAD, _LOG_FRAME = struct.Struct(">8I"), struct.Struct(">6I")
+_LOG_MAGICS = (0x377F0682, 0x377F0683)
+_LATEST_NS = 2**63 - 1
 UNKNOWN_TOPIC = "(topic unknown)"
 _TYPE = re.compile(r"\w+/(?:\w+/)?\w+")
 
@@ -85,7 +90,27 @@ class SqliteLog(MessageLog):
         self.notes.append(
             f"{pending[0].name} lies beside the database; both were copied and merged in a temporary folder."
         )
-        return sqlite3.connect(self._readable, check_same_thread=False)
+        database = sqlite3.connect(self._readable, check_same_thread=False)
+        if pending[0].name.endswith("-wal"):
+            self._judge_log(database)
+        return database
+
+    def _judge_log(self, database: sqlite3.Connection) -> None:
+        """Merge the copy of a write-ahead log, and say what of it SQLite does not take, which it keeps to itself."""
+        path = self._readable.with_name(self._readable.name + "-wal")
+        with path.open("rb") as file, mmap.mmap(file.fileno(), 0, access=mmap.ACCESS_READ) as log:
+            size, written = len(log), frames_of(log)
+        try:
+            _, _, taken = database.execute("PRAGMA wal_checkpoint").fetchone()
+        except sqlite3.DatabaseError:
+            return  # the database itself is damaged, which is told where it is read
+        if taken < 0:
+            self.notes.append("The database is of a kind that has no write-ahead log; the one beside it is not read.")
+        elif written < 0:
+            self._harm(Cause.CUT, f"the write-ahead log of {size} bytes is damaged and cannot be merged")
+        elif taken < written:
+            words = f"the last {written - taken} of {written} pages in the write-ahead log were not completed"
+            self._harm(Cause.CUT, f"{words} or are damaged; what they hold is lost")
 
     _SUM = "sum(timestamp % 1000003 * (id % 1009))"
     _COUNT = (
@@ -171,7 +196,8 @@ class SqliteLog(MessageLog):
 
     def _judge_strangers(self, count: int) -> None:
         if count:
-            self._harm(Cause.SCHEMA, f"{count} messages are of topics that the database does not describe")
+            words = f"{count} messages are of topics that the database does not describe"
+            self._harm(Cause.SCHEMA, words, topics={UNKNOWN_TOPIC: Tally(withheld=count)})
 
     def _read_tables(self) -> None:
         tables = {row[0] for row in self._database.execute("SELECT name FROM sqlite_master WHERE type = 'table'")}
@@ -190,11 +216,11 @@ class SqliteLog(MessageLog):
         for number, topic, kind, encoding in topics:
             schema_encoding, schema = definitions.get(kind, ("", ""))
             self._by_id[number] = Channel(
-                topic=escaped(str(topic)),
-                type=escaped(str(kind)),
-                encoding=escaped(str(encoding)),
-                schema_encoding=escaped(str(schema_encoding)),
-                schema=str(schema).encode(),
+                topic=escaped(_word(topic)),
+                type=escaped(_word(kind)),
+                encoding=escaped(_word(encoding)),
+                schema_encoding=escaped(_word(schema_encoding)),
+                schema=_word(schema).encode(),
             )
         self.channels = list(self._by_id.values())
 
@@ -219,12 +245,12 @@ class SqliteLog(MessageLog):
         """A query for messages of some topics in a range of time; the plain one lets SQLite skip other rows soonest."""
         which = "" if len(numbers) == len(self._by_id) else f"topic_id IN ({', '.join('?' * len(numbers))}) AND "
         return (
-            f"SELECT {columns} FROM {self._table} WHERE {which}timestamp >= ? AND timestamp < ?"
+            f"SELECT {columns} FROM {self._table} WHERE {which}timestamp >= ? AND timestamp <= ?"
             " AND typeof(timestamp) = 'integer' AND data IS NOT NULL"
         )
 
     def _arguments(self, numbers: Collection[int], start_ns: int, stop_ns: int) -> list[int]:
-        return [*(() if len(numbers) == len(self._by_id) else numbers), start_ns, stop_ns]
+        return [*(() if len(numbers) == len(self._by_id) else numbers), start_ns, min(stop_ns - 1, _LATEST_NS)]
 
     def _sound(self, numbers: list[int], start_ns: int, stop_ns: int) -> Iterator[Message]:
         """The messages in the order of time; from where SQLite gives up, what their pages still hold."""
@@ -337,6 +363,26 @@ class SqliteLog(MessageLog):
         self._found = []
         if self._copy is not None:
             self._copy.cleanup()
+
+
+def frames_of(log: mmap.mmap) -> int:
+    """How many pages were written to a write-ahead log, the last of which may be cut; -1 if it is none.
+
+    Pages of an earlier use of it, behind those, have other salts. https://sqlite.org/fileformat2.html, section 4.1.
+    """
+    if len(log) < _LOG_HEAD.size:
+        return -1
+    magic, _, page_bytes, _, *salts = _LOG_HEAD.unpack_from(log)[:6]
+    if magic not in _LOG_MAGICS or not 512 <= page_bytes <= 65536:
+        return -1
+    places = range(_LOG_HEAD.size, len(log), _LOG_FRAME.size + page_bytes)
+    mine = (list(_LOG_FRAME.unpack_from(log, at)[2:4]) == salts for at in places if at + _LOG_FRAME.size <= len(log))
+    return sum(takewhile(bool, mine))
+
+
+def _word(value: object) -> str:
+    """A value that should be a text; SQLite takes any other for one, too."""
+    return text(value) if isinstance(value, bytes) else str(value)
 
 
 def _message(pages: Pages, row: Row) -> Found | None:

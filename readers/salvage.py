@@ -77,6 +77,23 @@ class Loss:
         return Damage(what=self.text, where=where, affected=(self.stop - self.start) / max(1, self.file_bytes))
 
 
+def lost_by_topic(counts: Iterable[tuple[str, int]]) -> dict[str, Tally]:
+    """Messages that are not there any more, by topic, of (topic, count); channels can share a topic."""
+    return _by_topic((topic, Tally(lost=count)) for topic, count in counts)
+
+
+def withheld_by_topic(counts: Iterable[tuple[str, int]]) -> dict[str, Tally]:
+    """Messages that are damaged, likewise."""
+    return _by_topic((topic, Tally(withheld=count)) for topic, count in counts)
+
+
+def _by_topic(pairs: Iterable[tuple[str, Tally]]) -> dict[str, Tally]:
+    found: dict[str, Tally] = {}
+    for topic, tally in pairs:
+        found[topic] = found.get(topic, Tally()) + tally
+    return found
+
+
 def tallies(recovered: Mapping[str, int], losses: Iterable[Loss]) -> dict[str, Tally]:
     """By topic: the messages that were read, and those that the losses are known to have cost."""
     total = {topic: Tally(recovered=count) for topic, count in recovered.items()}

@@ -173,6 +173,46 @@ def _hostile_topic(data: bytearray) -> None:
         data[mark.start() + 6 : mark.end()] = b"/\x00\n\x1b["
 
 
+def _chunk_taken_out(data: bytearray) -> bytes:
+    at = chunks(data)
+    return bytes(data[: at[3]] + data[at[4] :])
+
+
+def _chunks_swapped(data: bytearray) -> bytes:
+    at = chunks(data)
+    return bytes(data[: at[3]] + data[at[4] : at[5]] + data[at[3] : at[4]] + data[at[5] :])
+
+
+def _no_head(data: bytearray) -> None:
+    at = chunks(data)[3]
+    data[at : at + 40] = bytes(40)
+
+
+def _hundred_bytes_gone(data: bytearray) -> bytes:
+    start, _ = chunk_data(data, chunks(data)[3])
+    return bytes(data[: start + 500] + data[start + 600 :])
+
+
+def _no_kind_of_connections(data: bytearray) -> bytes:
+    """Neither in the chunks nor, as there is none, in the index."""
+    return _unindexed(bytearray(bytes(data).replace(b"op=\x07", b"op=\x17")))
+
+
+def _no_topic(data: bytearray) -> bytes:
+    return _unindexed(bytearray(bytes(data).replace(b"topic=/imu", b"tobic=/imu")))
+
+
+def _stranger(data: bytearray) -> None:
+    start, _ = chunk_data(data, chunks(data)[3])
+    data[data.index(b"conn=\0\0\0\0", start) + 5] = 9
+
+
+def _index_of_a_stranger(data: bytearray) -> bytes:
+    _, stop = chunk_data(data, chunks(data)[3])
+    data[data.index(b"conn=", stop) + 5] = 9
+    return _unindexed(data)
+
+
 def joined(folder: Path) -> Path:
     path = bag(folder)
     path.write_bytes(path.read_bytes() + b"garbage after the end" * 10)
@@ -216,6 +256,17 @@ ROS1_CASES = {
     "bomb": Case(edited(_bomb, "bz2"), 215, "more than the", counted=True),
     "bomb that claims little": Case(edited(lambda d: _bomb(d, 8000), "bz2"), 215, "states 8000 bytes", counted=True),
     "hostile topic": Case(edited(_hostile_topic), 240, ""),
+    "chunk taken out": Case(edited(_chunk_taken_out), 218, "not where the index states", counted=True),
+    "chunks swapped": Case(edited(_chunks_swapped), 240, ""),
+    "chunks swapped lz4": Case(edited(_chunks_swapped, "lz4"), 240, ""),
+    "chunk without a head": Case(edited(_no_head), 240, "no record begins"),
+    "chunk without a head lz4": Case(edited(_no_head, "lz4"), 240, "no record begins"),
+    "chunk without a head bz2": Case(edited(_no_head, "bz2"), 240, "no record begins"),
+    "100 bytes gone": Case(edited(_hundred_bytes_gone), 239, "break off", counted=True),
+    "damaged kind of connections": Case(edited(_no_kind_of_connections), 240, "what is left of it served"),
+    "connection without a topic": Case(edited(_no_topic), 40, "a connection in a chunk is damaged", named=True),
+    "message of a stranger": Case(edited(_stranger), 239, "does not describe", counted=True, named=True),
+    "index of a stranger": Case(edited(_index_of_a_stranger, "lz4"), 240, "than its index states"),
     "garbage after the end": Case(joined, 240, "no record can be read"),
 }
 
@@ -259,6 +310,40 @@ def metadata(change: Callable[[str], str] | None) -> Callable[[Path], Path]:
 def write_ahead(folder: Path) -> Path:
     """Half of the rows are in the write-ahead log."""
     return _left_behind(folder, "-wal", "PRAGMA journal_mode = WAL", "PRAGMA wal_autocheckpoint = 0")
+
+
+def torn_log(change: Callable[[bytearray], Any]) -> Callable[[Path], Path]:
+    """The same, with the write-ahead log damaged: SQLite leaves out what follows, without a word."""
+
+    def make(folder: Path) -> Path:
+        path = write_ahead(folder)
+        log = path.with_name(path.name + "-wal")
+        data = bytearray(log.read_bytes())
+        result = change(data)
+        log.write_bytes(data if result is None else result)
+        return path
+
+    return make
+
+
+def _flip_in_the_middle(data: bytearray) -> None:
+    data[len(data) // 2] ^= 4
+
+
+def old_pages_in_the_log(folder: Path) -> Path:
+    """A write-ahead log that was begun anew: behind its pages lie those of the use before, which count no more."""
+    source, target = database(folder), folder / "live.db3"
+    connection = sqlite3.connect(source, isolation_level=None)
+    connection.execute("PRAGMA journal_mode = WAL")
+    connection.execute("PRAGMA wal_autocheckpoint = 0")
+    connection.execute("UPDATE messages SET timestamp = timestamp + 1")
+    connection.execute("UPDATE messages SET timestamp = timestamp - 1")
+    connection.execute("PRAGMA wal_checkpoint")
+    connection.execute("UPDATE messages SET timestamp = timestamp WHERE id = 1")
+    shutil.copy(source, target)
+    shutil.copy(source.with_name(source.name + "-wal"), target.with_name(target.name + "-wal"))
+    connection.close()
+    return target
 
 
 def hot_journal(folder: Path) -> Path:
@@ -331,6 +416,12 @@ BOMB = "a: &a [x,x,x,x,x,x,x,x,x]\n" + "".join(
 DB3_CASES = {
     "zero length": Case(lambda folder: raw(b"")(folder).rename(folder / "a.db3"), 0, "0 bytes"),
     "half in the write-ahead log": Case(write_ahead, 240, ""),
+    "torn write-ahead log": Case(torn_log(_flip_in_the_middle), 120, "not completed or are damaged", named=True),
+    "cut write-ahead log": Case(
+        torn_log(lambda data: data[: len(data) // 2]), 120, "not completed or are damaged", named=True
+    ),
+    "garbage as write-ahead log": Case(torn_log(lambda data: b"garbage" * 999), 120, "cannot be merged", named=True),
+    "old pages in the write-ahead log": Case(old_pages_in_the_log, 240, "copied and merged"),
     "hot journal": Case(hot_journal, 240, ""),
     "8 kB of zeros": Case(pages(_zero_pages), 215, "known to be lost", counted=True),
     "false index of times": Case(pages(_false_index), 240, "the index of times differs"),

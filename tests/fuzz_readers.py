@@ -187,13 +187,13 @@ def only_true_pictures(outcome: Outcome, sound: Outcome) -> str:
 # ---------------------------------------------------------------------------------- what they are
 
 
-def _mcap(codec: str) -> Subject:
+def _mcap(codec: str, *, index: bool = True) -> Subject:
     def make(folder: Path) -> Path:
         path = folder / "a.mcap"
-        small_log(path, codec)
+        small_log(path, codec, index=index)
         return path
 
-    return Subject(f"mcap-{codec}", make, checked, messages_of)
+    return Subject(f"mcap-{codec}" if index else f"mcap-{codec}-unindexed", make, checked, messages_of)
 
 
 def _ros2_mcap(folder: Path) -> Path:
@@ -298,6 +298,7 @@ def _landmarks() -> Content:
 
 SUBJECTS = (
     *(_mcap(codec) for codec in ("none", "lz4", "zstd")),
+    *(_mcap(codec, index=False) for codec in ("none", "zstd")),
     *(_ros1(codec) for codec in ("none", "lz4", "bz2")),
     Subject("db3", _db3, counted, messages_of),
     Subject("db3-packed", _packed_db3, counted, messages_of),

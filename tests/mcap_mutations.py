@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from mcap.writer import CompressionType, Writer
+from mcap.writer import CompressionType, IndexType, Writer
 
 from readers.mcap_log import McapLog
 from readers.message_log import in_log_order
@@ -28,10 +28,12 @@ class Small(NamedTuple):
     keys: list[Key]
 
 
-def small_log(path: Path, codec: str) -> Small:
+def small_log(path: Path, codec: str, *, index: bool = True) -> Small:
     rng, keys = np.random.default_rng(1), []
+    flags = dict.fromkeys(("repeat_channels", "repeat_schemas", "use_statistics", "use_summary_offsets"), index)
+    kinds = IndexType.ALL if index else IndexType.NONE
     with path.open("wb") as file:
-        writer = Writer(file, chunk_size=1000, compression=CompressionType[codec.upper()])
+        writer = Writer(file, chunk_size=1000, compression=CompressionType[codec.upper()], index_types=kinds, **flags)
         writer.start(profile="ros2", library="test")
         number = writer.register_schema("my_msgs/msg/Own", "ros2msg", b"uint8[] data")
         channels = [writer.register_channel(topic, "cdr", number) for topic in ("/a", "/b")]

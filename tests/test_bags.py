@@ -11,14 +11,30 @@ from typing import Any
 
 import numpy as np
 import pytest
-from made_logs import MS, ROS1, ROS2, START_NS, Entry, Maker, drive, plain, write_ros1, write_ros2
+import zstandard
+from made_logs import (
+    MS,
+    ROS1,
+    ROS2,
+    START_NS,
+    Entry,
+    Maker,
+    drive,
+    plain,
+    raw_ros,
+    write_mcap,
+    write_ros1,
+    write_ros2,
+)
 from recordings_dir import RECORDINGS
 from rosbags.highlevel import AnyReader
 from rosbags.typesys import Stores, get_typestore
 
 import readers
-from readers import open_recording
+from readers import bag_folder, open_recording
+from readers.bag_folder import missing_numbers
 from readers.clock import survey
+from readers.log_recording import LogRecording
 from readers.messages import Arrival, reader_of, samples_of
 from readers.streams import Problem, ReadOptions, Recording, RecordingError, StreamError, StreamKind
 
@@ -127,13 +143,123 @@ def test_several_files_are_one_log(tmp_path: Path, storage: str, metadata: bool)
         assert read_all(recording) == expected_samples(ROS2)
 
 
-def test_a_missing_part_is_named_and_the_others_are_read(tmp_path: Path) -> None:
-    folder = write_ros2(tmp_path / "bag", drive(ROS2))
-    text = (folder / "metadata.yaml").read_text()
-    (folder / "metadata.yaml").write_text(text.replace("- bag.db3", "- bag.db3\n  - bag_1.db3", 1))
+def split_bag(tmp_path: Path, storage: str) -> Path:
+    """A bag of two parts, the first half of the drive and the second, with metadata.yaml of the whole."""
+    entries, suffix = drive(ROS2), {"sqlite3": ".db3", "mcap": ".mcap"}[storage]
+    folder = write_ros2(tmp_path / "bag", entries, storage)
+    (folder / f"bag{suffix}").unlink()
+    for i, part in enumerate((entries[: len(entries) // 2], entries[len(entries) // 2 :])):
+        shutil.copy(write_ros2(tmp_path / f"p{i}", part, storage) / f"p{i}{suffix}", folder / f"bag_{i}{suffix}")
+    metadata = folder / "metadata.yaml"
+    metadata.write_text(metadata.read_text().replace(f"- bag{suffix}", f"- bag_0{suffix}\n  - bag_1{suffix}", 1))
+    return folder
+
+
+@pytest.mark.parametrize("storage", ["sqlite3", "mcap"])
+@pytest.mark.parametrize("metadata", [True, False])
+@pytest.mark.parametrize("content", [None, b"", b"garbage" * 99])
+def test_a_part_that_is_gone_is_a_loss_and_the_others_are_read(
+    tmp_path: Path, storage: str, metadata: bool, content: bytes | None
+) -> None:
+    folder = split_bag(tmp_path, storage)
     with open_recording(folder) as recording:
-        assert any("bag_1.db3 is missing" in note for note in recording.notes)
+        assert not recording.damage
+        whole = {stream.name: stream.count for stream in recording.streams}
+    part = next(folder.glob("bag_1.*"))
+    part.unlink()
+    if content is not None:
+        part.write_bytes(content)
+    if not metadata:
+        (folder / "metadata.yaml").unlink()
+    with open_recording(folder) as recording:
+        assert isinstance(recording, LogRecording)
+        left = {stream.name: stream.count for stream in recording.streams}
+        assert left["/imu"] == len(list(recording.read(["/imu"]))) > 90
+        if metadata:
+            lost = {topic: tally.lost for loss in recording.losses for topic, tally in loss.topics.items()}
+            assert left["/imu"] + lost["/imu"] == whole["/imu"]
+        said = any(part.name in str(damage) for damage in recording.damage)
+        assert said or (content is None and not metadata)
+
+
+def test_numbers_that_lack_between_the_parts_are_noted(tmp_path: Path) -> None:
+    assert missing_numbers(["a_9.bag", "a_10.bag", "a_13.bag"]) == ["a_11.bag", "a_12.bag"]
+    assert missing_numbers(["20240102.bag", "20250304.bag"]) == missing_numbers(["a.bag"]) == []
+    folder = split_bag(tmp_path, "mcap")
+    (folder / "metadata.yaml").unlink()
+    (folder / "bag_1.mcap").rename(folder / "bag_2.mcap")
+    with open_recording(folder) as recording:
+        assert "There is no bag_1.mcap between the parts of the log." in recording.notes
         assert read_all(recording) == expected_samples(ROS2)
+
+
+def packed(folder: Path, plain: Path) -> tuple[Path, bytes]:
+    """A file packed with zstd, in blocks of which each can be unpacked without the next."""
+    writer = zstandard.ZstdCompressor(level=1).compressobj()
+    data = plain.read_bytes()
+    pieces = [
+        writer.compress(data[at : at + 4096]) + writer.flush(zstandard.COMPRESSOBJ_FLUSH_BLOCK)
+        for at in range(0, len(data), 4096)
+    ]
+    path = folder / f"{plain.name}.zstd"
+    path.write_bytes(b"".join(pieces) + writer.flush())
+    return path, path.read_bytes()
+
+
+@pytest.mark.parametrize("damage", ["cut", "flip", "more"])
+def test_of_a_damaged_zstd_file_the_part_before_the_damage_is_read(tmp_path: Path, damage: str) -> None:
+    plain = write_mcap(tmp_path / "a.mcap", raw_ros(drive(ROS2), 2), "ros2", chunk_size=4096)
+    path, data = packed(tmp_path, plain)
+    half = len(data) // 2
+    path.write_bytes(
+        {"cut": data[:half], "flip": data[:half] + bytes(99) + data[half + 99 :], "more": data + b"?"}[damage]
+    )
+    with open_recording(path) as recording:
+        assert isinstance(recording, LogRecording)
+        found = [(m.channel.topic, m.log_ns, bytes(m.data)) for m in recording.messages()]
+        told = " ".join(loss.text for loss in recording.losses)
+    written = [(entry.topic, entry.log_ns, entry.data) for entry in raw_ros(drive(ROS2), 2)]
+    assert told
+    assert set(found) <= set(written) or "read without a checksum" in told
+    assert len(found) == len(written) if damage == "more" else len(found) > 0.4 * len(written)
+
+
+def test_a_zstd_bomb_does_not_fill_the_disk(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(bag_folder, "HARMLESS_BYTES", 1 << 20)
+    monkeypatch.setattr(bag_folder, "LARGEST_RATIO", 8)
+    folder = write_ros2(tmp_path / "bag", drive(ROS2))
+    path = tmp_path / "a.db3.zstd"
+    path.write_bytes(zstandard.compress((folder / "bag.db3").read_bytes() + bytes(1 << 24)))
+    with open_recording(path) as recording:
+        assert isinstance(recording, LogRecording)
+        assert any("bytes are unpacked of" in loss.text for loss in recording.losses)
+        assert recording._scratch is not None
+        assert sum(file.stat().st_size for file in Path(recording._scratch.name).iterdir()) < 2 << 20
+
+
+def test_a_refused_zstd_file_leaves_no_folder_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "scratch"))
+    (tmp_path / "scratch").mkdir()
+    path = tmp_path / "a.mcap.zstd"
+    path.write_bytes(zstandard.compress(b"SQLite format 3\0" + bytes(5000)))
+    try:
+        open_recording(path)
+    except RecordingError as error:
+        kept = error  # as a caller keeps it, with all that its frames refer to
+    assert "zstd" in str(kept)
+    assert list((tmp_path / "scratch").iterdir()) == []
+
+
+def test_times_at_the_end_of_their_range_are_read(tmp_path: Path) -> None:
+    path = write_ros2(tmp_path / "bag", drive(ROS2)) / "bag.db3"
+    with sqlite3.connect(path) as connection:
+        connection.execute("UPDATE messages SET timestamp = ? WHERE id = 5", (2**63 - 1,))
+        connection.execute("UPDATE messages SET timestamp = 0 WHERE id = 6")
+    connection.close()
+    with open_recording(path) as recording:
+        assert isinstance(recording, LogRecording)
+        times = [message.log_ns for message in recording.messages()]
+    assert (times[0], times[-1], len(times)) == (0, 2**63 - 1, len(drive(ROS2)))
 
 
 @pytest.mark.parametrize("text", ["", "a: [", "rosbag2_bagfile_information: 3", "&a [*a, *a]"])
@@ -424,7 +550,7 @@ def test_a_database_without_a_readable_row_is_refused(tmp_path: Path) -> None:
         (
             b"\x28\xb5\x2f\xfd" + b"\xff" * 50,
             "a.db3.zstd",
-            "a.db3.zstd: inside of the zstd file: it cannot be unpacked",
+            "a.db3.zstd: it cannot be unpacked",
         ),
         (b"RRF2aaaa", "a.rrd", "Rerun recording"),
     ],

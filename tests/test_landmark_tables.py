@@ -11,6 +11,7 @@ from recordings_dir import RECORDINGS
 from scipy.spatial.transform import Rotation
 
 from readers import ReadOptions, open_recording
+from readers.landmark_tables import COURSE_SHAPES
 from readers.streams import LandmarkSample, OdometrySample, PoseSample, Recording, RecordingError, TrackSample
 
 STARRY = RECORDINGS / "_no_licence_stated" / "starry_night_stereo_landmarks"
@@ -147,3 +148,30 @@ def test_a_table_beside_images_leaves_them_a_folder_of_images(tmp_path: Path) ->
     recording = open_recording(tmp_path, ReadOptions(rate_hz=10.0))
     assert recording.format.startswith("image folder")
     assert [info.count for info in recording.streams] == [2]
+
+
+@pytest.mark.parametrize("number", ["9e30", "63.5", "-1"])
+def test_what_is_no_number_of_a_landmark_is_left_out_and_said(tmp_path: Path, number: str) -> None:
+    sighting = f"1248272273.5 63 2.0 0.25\n1248272273.6 {number} 3.0 -0.5\n"
+    survey, codes = f"6 1 2 0 0\n{number} 4 5 0 0\n", f"6 63\n{number} 5\n"
+    folder = write_mrclam(tmp_path, Robot1_Measurement=sighting, Landmark_Groundtruth=survey, Barcodes=codes)
+    with np.errstate(invalid="raise"):
+        recording = open_recording(folder)
+    assert [s.ids.tolist() for s in sightings(recording)] == [[6]]
+    assert set(recording.landmarks) == {6}
+    assert {damage.where for damage in recording.damage} == {
+        "Robot1_Measurement.dat line 2",
+        "Landmark_Groundtruth.dat line 2",
+        "Barcodes.dat line 2",
+    }
+
+
+@pytest.mark.parametrize("times", [[[0.0, np.nan]], [[0.0, 1e300]], [[0.0, 1j]], np.array([["a", "b"]])], ids=str)
+def test_a_course_table_of_other_than_finite_numbers_is_refused(tmp_path: Path, times: object) -> None:
+    shapes = {"K": 2, "J": 3}
+    table = {name: np.zeros([shapes.get(str(n), n) for n in shape]) for name, shape in COURSE_SHAPES.items()}
+    scipy.io.savemat(tmp_path / "sound.mat", table | {"t": [[0.0, 1.0]]})
+    assert open_recording(tmp_path / "sound.mat").streams
+    scipy.io.savemat(tmp_path / "dataset.mat", table | {"t": times})
+    with pytest.raises(RecordingError, match=r"dataset\.mat.*\bt\b"):
+        open_recording(tmp_path / "dataset.mat")

@@ -4,6 +4,7 @@ import resource
 import struct
 import time
 import zlib
+from collections import Counter
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
@@ -20,11 +21,15 @@ from made_mcap import (
     HEADER,
     MAGIC,
     MESSAGE,
+    MESSAGE_INDEX,
+    METADATA_INDEX,
     SCHEMA,
+    SUMMARY_OFFSET,
     Entry,
     channel,
     chunk,
     message,
+    message_index,
     record,
     schema,
     string,
@@ -387,6 +392,160 @@ def test_the_data_checksum_guards_messages_that_have_no_other(tmp_path: Path) ->
     assert len(found) == 24
     assert [loss.what for loss in log.losses] == [Cause.CHECKSUM]
     assert "24 messages have no other" in log.losses[0].text
+
+
+# ------------------------------------------------------------ what checksums prove, and what statistics tell
+
+
+def dead_head(log: Log) -> bytes:
+    """The first bytes of a chunk record are zeros."""
+    return patched(log, 3, 0, bytes(60))
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_a_chunk_that_its_checksum_proves_is_read_whatever_follows_it(tmp_path: Path, codec: str) -> None:
+    path = tmp_path / "a.mcap"
+    log = made(path, codec, index=False)
+    path.write_bytes(dead_head(log))
+    found, opened = read(path)
+    assert Counter(log.keys) - Counter(found) == Counter(log.keys[sum(c[2] for c in log.chunks[:3]) :][:24])
+    assert opened.losses
+
+
+@pytest.mark.parametrize("codec", CODECS)
+@pytest.mark.parametrize("bit", range(8))
+def test_a_chunk_whose_kind_is_damaged_is_read_by_its_checksum(tmp_path: Path, codec: str, bit: int) -> None:
+    path = tmp_path / "a.mcap"
+    log = made(path, codec, index=False)
+    path.write_bytes(patched(log, 3, 0, bytes([CHUNK ^ 1 << bit])))
+    found, opened = read(path)
+    assert found == log.keys
+    assert [loss.text for loss in opened.losses] == [
+        "the head of a chunk record is damaged; the chunk's checksum served"
+    ]
+    damaged = bytearray(patched(log, 3, 0, bytes([CHUNK ^ 1 << bit])))
+    damaged[log.chunks[3][0] + 300] ^= 1
+    path.write_bytes(damaged)
+    found, opened = read(path)
+    assert set(found) < set(log.keys)
+    assert opened.losses
+
+
+def test_a_damaged_chunk_does_not_swallow_the_sound_one_that_it_reaches_into(tmp_path: Path) -> None:
+    first, second = (
+        bytearray(record(CHUNK, chunk(b"".join(records), (START_NS, START_NS + 23))))
+        for records in (
+            [record(MESSAGE, message(entry)) for entry in ENTRIES[:12]],
+            [record(MESSAGE, message(entry)) for entry in ENTRIES[12:]],
+        )
+    )
+    head = len(record(CHUNK, chunk(b"", (0, 0))))
+    for at in (1, head - 8):  # both lengths reach up to the first message in the second chunk
+        struct.pack_into("<Q", first, at, struct.unpack_from("<Q", first, at)[0] + head)
+    found, log = hostile(tmp_path, DESCRIBED, bytes(first), bytes(second))
+    assert [key[1] for key in found] == [START_NS + i for i in range(12, 24)]
+    (loss,) = log.losses
+    assert (loss.what, loss.stop - loss.start) == (Cause.CHECKSUM, len(first))
+
+
+@pytest.mark.parametrize("kind", [HEADER, METADATA_INDEX, 0x80 | MESSAGE])
+def test_a_message_that_turned_into_another_record_is_said(tmp_path: Path, kind: int) -> None:
+    path = tmp_path / "a.mcap"
+    log = made(path, index=False, chunked=False)
+    data = bytearray(log.data)
+    data[log.data.index(log.keys[7][2]) - 31] = kind
+    path.write_bytes(data)
+    found, opened = read(path)
+    assert found == log.keys[:7] + log.keys[8:]
+    assert any(loss.stop > loss.start for loss in opened.losses)
+
+
+def test_the_last_message_is_read_though_the_record_behind_it_is_damaged(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    log = made(path, index=False, chunked=False)
+    data = bytearray(log.data)
+    data[log.data.rindex(log.keys[-1][2]) + 200] = SUMMARY_OFFSET
+    path.write_bytes(data)
+    found, opened = read(path)
+    assert found == log.keys
+    assert opened.losses
+
+
+def test_the_statistics_of_a_summary_that_was_moved_count_what_is_gone(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    log = made(path)
+    at, size, count = log.chunks[3]
+    path.write_bytes(log.data[:at] + log.data[at + size :])
+    found, opened = read(path)
+    assert len(found) == COUNT - count
+    total = tallies({topic: sum(key[0] == topic for key in found) for topic in ("/a", "/b")}, opened.losses)
+    assert {topic: (tally.recovered, tally.lost) for topic, tally in total.items()} == {
+        "/a": (108, 12),
+        "/b": (108, 12),
+    }
+    flipped = bytearray(log.data[:at] + log.data[at + size :])
+    flipped[flipped.rindex(struct.pack("<QH", COUNT, 1)) + 4] ^= 1  # statistics that nothing proves
+    path.write_bytes(flipped)
+    assert not any(loss.topics for loss in read(path)[1].losses)
+
+
+@pytest.mark.parametrize("wanted", [("/a",), ("/a", "/b"), ("/b", "/a")])
+def test_a_chunk_that_is_gone_is_counted_by_topic_however_it_is_read(tmp_path: Path, wanted: tuple[str, ...]) -> None:
+    path = tmp_path / "a.mcap"
+    log = made(path)
+    path.write_bytes(dead_head(log))
+    with open_log(path) as opened:
+        for topic in wanted:
+            list(in_log_order(opened.sources([channel for channel in opened.channels if channel.topic == topic])))
+        (loss,) = opened.losses
+        assert {topic: tally.lost for topic, tally in loss.topics.items()} == {"/a": 12, "/b": 12}
+        assert (loss.start, loss.stop) == (log.chunks[3][0], log.chunks[3][0] + log.chunks[3][1])
+
+
+def test_channels_that_share_a_topic_are_counted_together(tmp_path: Path) -> None:
+    second = record(CHANNEL, channel(2, 1, "/a", "json", {}))
+    records = RECORDS + b"".join(record(MESSAGE, message(entry._replace(channel=2))) for entry in ENTRIES[:5])
+    damaged = bytearray(good_chunk(records))
+    damaged[-3] ^= 4
+    indexes = [record(MESSAGE_INDEX, message_index(n, [(START_NS, 0)] * count)) for n, count in ((1, 24), (2, 5))]
+    _, log = hostile(tmp_path, DESCRIBED, second, bytes(damaged), *indexes, good_chunk())
+    assert {topic: tally.withheld for loss in log.losses for topic, tally in loss.topics.items()} == {"/a": 29}
+
+
+def test_a_file_of_many_false_chunk_heads_takes_no_long_time(tmp_path: Path) -> None:
+    head = record(CHUNK, struct.pack("<QQQI", 0, 0, 1 << 20, 1) + string("") + struct.pack("<Q", 1 << 20))
+    path = tmp_path / "a.mcap"
+    path.write_bytes(HEAD + head * 40_000 + bytes(1 << 20))
+    _, log = read(path)
+    assert log.losses
+
+
+@pytest.mark.parametrize("index", [True, False])
+def test_a_chunk_whose_checksum_is_gone_is_said_to_be_unproven(tmp_path: Path, index: bool) -> None:
+    path = tmp_path / "a.mcap"
+    log = made(path, "none", index=index)
+    for number in (0, 3):
+        path.write_bytes(patched(log, number, 9 + 24, bytes(4)))
+        found, opened = read(path)
+        assert found == log.keys
+        (loss,) = opened.losses
+        assert (loss.what, loss.start) == (Cause.CHECKSUM, log.chunks[number][0])
+        assert f"its {log.chunks[number][2]} messages are read without a checksum" in loss.text
+    bare = log.data
+    for offset, _, _ in log.chunks:
+        bare = bare[: offset + 33] + bytes(4) + bare[offset + 37 :]
+    path.write_bytes(bare)
+    assert read(path)[1].losses == []
+
+
+def test_a_chunk_that_seems_to_be_empty_is_said_to_hold_more(tmp_path: Path) -> None:
+    path = tmp_path / "a.mcap"
+    log = made(path, index=False)
+    path.write_bytes(patched(log, 3, 25, bytes(60)))
+    found, opened = read(path)
+    assert set(found) < set(log.keys)
+    offset, size, _ = log.chunks[3]
+    assert (Cause.CUT, offset + size) in {(loss.what, loss.stop) for loss in opened.losses}
 
 
 @pytest.mark.parametrize(("more", "by_index"), [(0, True), (1, True), (16, False)])

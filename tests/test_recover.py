@@ -10,7 +10,7 @@ from collections import Counter
 from pathlib import Path
 
 import pytest
-from bad_bags import DB3_CASES, MESSAGES, ROS1_CASES, TOPICS, entries
+from bad_bags import DB3_CASES, MESSAGES, ROS1_CASES, TOPICS, chunk_data, chunks, entries
 from made_logs import ROS1, ROS2, START_NS, plain, write_ros1, write_ros2
 from mcap.reader import make_reader
 from mcap_ros1.decoder import DecoderFactory as Ros1Decoder
@@ -193,3 +193,18 @@ def test_ctrl_c_leaves_a_readable_file(tmp_path: Path) -> None:
         assert isinstance(recording, LogRecording)
         assert recording.damage == ()
         assert 50 <= sum(1 for _ in recording.messages()) < MESSAGES
+
+
+def test_a_log_of_which_nothing_can_be_read_is_refused(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    path, out = write_ros1(tmp_path / "a.bag", entries(ROS1), "bz2", 8192), tmp_path / "out.mcap"
+    data = bytearray(path.read_bytes())
+    for at in chunks(data):
+        data[sum(chunk_data(data, at)) // 2] ^= 1
+    path.write_bytes(data)
+    (tmp_path / "b.mcap").write_bytes(b"\x89MCAP0\r\n")
+    for file, words in ((path, "a bz2 chunk"), (tmp_path / "b.mcap", "was not closed")):
+        assert main(["inspect", str(file)]) == 2
+        assert words in capsys.readouterr().out
+        assert main(["recover", str(file), "-o", str(out)]) == 2
+        assert f"{file.name}: nothing of it can be read (" in capsys.readouterr().err
+        assert not out.exists()

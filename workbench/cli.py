@@ -154,7 +154,10 @@ def inspect(
     distro: Distribution = "",
     no_cache: NoCache = False,
 ) -> None:
-    """Show what is in a recording: streams, cameras, damage, and what is odd about its clocks."""
+    """Show what is in a recording: streams, cameras, damage, and what is odd about its clocks.
+
+    Exit status: 0 nothing is damaged, 3 something was lost, 2 nothing can be read.
+    """
     from workbench.opening import open_any
 
     options = _options(
@@ -180,7 +183,14 @@ def inspect(
         else:
             _print_recording(recording, values)
         if values["damage"]:
-            raise typer.Exit(IN_PART)
+            raise typer.Exit(IN_PART if quick or _is_usable(values) else REFUSED)
+
+
+def _is_usable(values: Mapping[str, Any]) -> bool:
+    """Whether anything of a damaged recording could be read, or named at least."""
+    loss = values["loss"]
+    beside = any(values[name] for name in ("attachments", "metadata", "lost_beside_messages"))
+    return not loss or beside or any(topic["recovered"] for topic in loss["topics"])
 
 
 def _lost(recording: Recording, quick: bool) -> dict[str, Any]:

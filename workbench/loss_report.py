@@ -31,6 +31,11 @@ class Good:
 class GoodMessages(dict[str, Good]):
     """By topic the messages that could be read."""
 
+    @property
+    def total(self) -> int:
+        """How many messages there are of all topics."""
+        return sum(good.count for good in self.values())
+
     def add(self, message: Message) -> None:
         """Count one message."""
         self.setdefault(message.channel.topic, Good()).add(message.log_ns)

@@ -64,7 +64,7 @@ def recover(recording: Recording, path: Path, *, on_progress: Progress | None = 
         on_progress: called with the number of messages written and of those expected.
 
     Raises:
-        RecordingError: the path is taken, or cannot be written.
+        RecordingError: the path is taken, or cannot be written, or nothing of the damaged log can be read.
         StreamError: the recording is no log of messages.
         KeyboardInterrupt: as it came; what was written before it is a whole file.
     """
@@ -84,6 +84,10 @@ def recover(recording: Recording, path: Path, *, on_progress: Progress | None = 
         raise RecordingError(
             path, f"it cannot be written ({error.strerror or error})", "choose another folder"
         ) from error
+    if recording.damage and not any((copy.good.total, copy.attachments, copy.metadata, copy.skipped, copy.lost)):
+        path.unlink()
+        problem = f"nothing of it can be read ({recording.damage[0].what})"
+        raise RecordingError(recording.path, problem, "copy it again from where it was recorded")
     return Recovered(
         path=path,
         good=copy.good,
