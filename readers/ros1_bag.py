@@ -307,7 +307,8 @@ class Chunk:
         return sum(span.sum_ns for span in self.spans.values()) % 2**64
 
 
-class ChunkIndex(NamedTuple):
+@dataclass(frozen=True, eq=False)
+class ChunkIndex:
     """The index behind a chunk: its entries by connection; `complete` where another record follows it."""
 
     entries: dict[int, NDArray[np.void]]
@@ -318,7 +319,7 @@ class ChunkIndex(NamedTuple):
         """Where the messages begin in the chunk."""
         return [place for entries in self.entries.values() for place in entries["place"].tolist()]
 
-    @property
+    @cached_property
     def spans(self) -> dict[int, Span]:
         """What the chunk holds by connection."""
         return {
