@@ -36,6 +36,7 @@ class Ahead(Generic[Key, Value]):
         pause_s: how long it must take, from one block to the asking for the next one, for others to be begun.
         running: takes up what is being unpacked, so that who closes the file can wait for it (`settle`) even when this
             object was given up half way.
+        after: how many keys are taken before others are begun; who looks at the first few does not read on.
     """
 
     def __init__(
@@ -44,6 +45,7 @@ class Ahead(Generic[Key, Value]):
         blocks: Iterable[tuple[Key, int]],
         pause_s: float = WORTH_A_THREAD_S,
         running: set[Future[Any]] | None = None,
+        after: int = 1,
     ) -> None:
         self._load = load
         self._coming = iter(blocks)
@@ -52,15 +54,17 @@ class Ahead(Generic[Key, Value]):
         self._pause_s = pause_s
         self._running = set[Future[Any]]() if running is None else running
         self._given_s = float("inf")
+        self._after, self._taken = after, 0
 
     def take(self, key: Key) -> Value:
-        """The result for `key`. From the second key on the next ones are begun: one alone is no reading through."""
+        """The result for `key`; where it pays the next ones are begun."""
         future = self._begun.pop(key, (None, 0))[0]
         if future is None:
             while (passed := self._advance()) is not None and passed[0] is not key:
                 pass
-        if time.perf_counter() - self._given_s >= self._pause_s:
+        if self._taken >= self._after and time.perf_counter() - self._given_s >= self._pause_s:
             self._begin()
+        self._taken += 1
         value = self._load(key) if future is None else future.result()
         self._given_s = time.perf_counter()
         return value

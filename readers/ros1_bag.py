@@ -711,7 +711,8 @@ class Ros1Log(MessageLog):
                     yield chunk
 
         packed = ((chunk, chunk.record.u32(b"size")) for chunk in chosen() if chunk.packed)
-        ahead = Ahead(self._unpacked, packed, 0.0 if self._slow else WORTH_A_THREAD_S, self._running)
+        pause_s = 0.0 if self._slow else WORTH_A_THREAD_S
+        ahead = Ahead(self._unpacked, packed, pause_s, self._running, after=KEPT_CHUNKS)
         low, high = start_ns or 0, stop_ns if stop_ns is not None else _END_OF_TIME
         for chunk in chosen():
             select = partial(self._select, chunk, wanted, low, high, ahead)

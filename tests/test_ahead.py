@@ -76,6 +76,19 @@ def test_blocks_are_begun_only_where_there_is_work_to_hide_them_behind(pause_s: 
     ahead.stop()
 
 
+def test_who_looks_at_the_first_blocks_alone_has_no_other_unpacked() -> None:
+    begun: list[int] = []
+    ahead = Ahead(lambda key: begun.append(key), [(key, 1) for key in range(9)], 0.0, after=3)  # type: ignore[func-returns-value]
+    for key in range(3):
+        ahead.take(key)
+    time.sleep(0.05)
+    assert begun == [0, 1, 2]
+    ahead.take(3)
+    ahead.take(4)
+    ahead.stop()
+    assert max(begun) > 4
+
+
 def test_what_was_given_up_half_way_is_settled_before_the_file_is_closed() -> None:
     slow, done = threading.Event(), []
 
