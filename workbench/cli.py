@@ -189,7 +189,8 @@ def inspect(
 def _is_usable(values: Mapping[str, Any]) -> bool:
     """Whether anything of a damaged recording could be read."""
     loss = values["loss"]
-    return not loss or any(topic["recovered"] for topic in loss["topics"]) or bool(values["attachments"])
+    beside = values["attachments"] or values["lost_beside_messages"]
+    return not loss or bool(beside) or any(topic["recovered"] for topic in loss["topics"])
 
 
 def _lost(recording: Recording, quick: bool) -> dict[str, Any]:
