@@ -207,6 +207,7 @@ class StreamAudit:
             f"at most by {self.longest_jump_ns / 1e9:+.3f} s",
             "stamp_rollover": f"times the header stamps begin anew, as {' and '.join(self._rollovers)} does",
             "foreign_publish_time": "publish times are of another epoch than log time",
+            "late_log_time": "log times lie beyond the year 2262, where 64 bits end; the last moment was used",
             "foreign_stamp": "header stamps are of another epoch; log time was used",
             "frozen_stamp": "header stamps never advance; log time was used",
             "zero_quaternion": "quaternions are all zero and were read as unknown",

@@ -626,6 +626,8 @@ def array(*values: Any) -> FloatArray:
 
 
 UNKNOWN_QUAT = array(*[np.nan] * 4)
+LATEST_NS = 2**63 - 1
+"""The last moment that a sample can have; MCAP knows later ones, which are taken for it."""
 UNKNOWN_VEC3 = array(*[np.nan] * 3)
 UNKNOWN_COV6 = array(*[[np.nan] * 6] * 6)
 UNKNOWN_COV3 = array(*[[np.nan] * 3] * 3)
