@@ -239,7 +239,9 @@ def test_times_that_64_bits_do_not_hold_are_told_and_stop_nothing(
 @pytest.mark.parametrize("seconds", ["1e400", "1e30", "null", '"soon"', "NaN", "[1]"])
 def test_a_stamp_in_json_that_is_no_time_spoils_its_message_only(tmp_path: Path, seconds: str) -> None:
     def raw(i: int, stamp: str) -> Raw:
-        text = f'{{"timestamp": {{"sec": {stamp}, "nsec": 5}}, "frame_id": "cam", "format": "jpeg", "data": "/9j/2Q=="}}'
+        text = (
+            f'{{"timestamp": {{"sec": {stamp}, "nsec": 5}}, "frame_id": "cam", "format": "jpeg", "data": "/9j/2Q=="}}'
+        )
         schema = ("foxglove.CompressedImage", "jsonschema", b"{}")
         return Raw("/cam", schema, "json", START_NS + i * MS, text.encode())
 

@@ -18,6 +18,7 @@ from made_mcap import (
     CHANNEL,
     CHUNK,
     DATA_END,
+    FOOTER,
     HEADER,
     MAGIC,
     MESSAGE,
@@ -546,3 +547,22 @@ def test_a_chunk_that_seems_to_be_empty_is_said_to_hold_more(tmp_path: Path) -> 
     assert set(found) < set(log.keys)
     offset, size, _ = log.chunks[3]
     assert (Cause.CUT, offset + size) in {(loss.what, loss.stop) for loss in opened.losses}
+
+
+@pytest.mark.parametrize("codec", CODECS)
+def test_channels_that_only_the_summary_describes_any_more_serve(tmp_path: Path, codec: str) -> None:
+    path = tmp_path / "a.mcap"
+    log = made(path, codec)
+    first = log.chunks[0]
+    damaged = bytearray(log.data[:-1])  # without an end, so that the summary is no index
+    damaged[first[0] + first[1] // 2] ^= 8
+    path.write_bytes(damaged)
+    found, opened = read(path)
+    assert found == log.keys[first[2] :]
+    assert not any("does not describe" in loss.text for loss in opened.losses)
+
+
+def test_a_log_goes_on_behind_a_footer_in_its_middle(tmp_path: Path) -> None:
+    found, log = hostile(tmp_path, DESCRIBED, good_chunk(), record(FOOTER, bytes(20)), good_chunk())
+    assert len(found) == 48
+    assert [loss.text for loss in log.losses] == ["the log goes on behind its footer"]
