@@ -17,7 +17,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from readers.streams import CameraInfo, Fact, ImageSample, Problem, Recording, Sample, StreamKind
+from readers.streams import CameraInfo, Fact, ImageError, ImageSample, Problem, Recording, Sample, StreamKind
 
 SECOND_NS = 1_000_000_000
 DAY_NS = 86_400 * SECOND_NS
@@ -101,6 +101,7 @@ class StreamAudit:
     samples: int = 0
     longest_gap_ns: int = 0
     longest_jump_ns: int = 0
+    first_bad_image: str = ""
     size_px: tuple[int, int] = (0, 0)
     _steps_ns: array[int] = field(default_factory=lambda: array("q"))
     _lags_ns: array[int] = field(default_factory=lambda: array("q"))
@@ -131,6 +132,8 @@ class StreamAudit:
         quat = getattr(sample, "quat_xyzw", None)
         if quat is not None and quat[3] == 0.0 and not np.any(quat):
             self.counts["zero_quaternion"] += 1
+        if isinstance(sample, ImageSample):
+            self._check_image(sample)
         if isinstance(sample, ImageSample) and sample.width_px:
             size = (sample.width_px, sample.height_px)
             if self.size_px not in ((0, 0), size):
@@ -138,6 +141,13 @@ class StreamAudit:
             self.size_px = size
         elif isinstance(sample, CameraInfo):
             self.size_px = (sample.camera.width_px, sample.camera.height_px)
+
+    def _check_image(self, sample: ImageSample) -> None:
+        try:
+            sample.check()
+        except ImageError as error:
+            self.counts["bad_image"] += 1
+            self.first_bad_image = self.first_bad_image or str(error)
 
     def _add_clocks(self, sample: Sample) -> None:
         """Take note of how the message's own stamp and its publish time stand to log time."""
@@ -197,12 +207,14 @@ class StreamAudit:
             f"at most by {self.longest_jump_ns / 1e9:+.3f} s",
             "stamp_rollover": f"times the header stamps begin anew, as {' and '.join(self._rollovers)} does",
             "foreign_publish_time": "publish times are of another epoch than log time",
+            "late_log_time": "log times lie beyond the year 2262, where 64 bits end; the last moment was used",
             "foreign_stamp": "header stamps are of another epoch; log time was used",
             "frozen_stamp": "header stamps never advance; log time was used",
             "zero_quaternion": "quaternions are all zero and were read as unknown",
             "quaternion_norm": "quaternions are not of unit norm and were scaled",
             "identity_orientation": "orientations are the identity with zero covariance, as if never measured; kept",
             "spare_bytes": "images hold more bytes than their rows and step make; the rest was left out",
+            "bad_image": f"images cannot be decoded, the first of {self.first_bad_image}",
             "size_change": "images differ in size from the one before",
             "gap": f"gaps are longer than {GAP_FACTOR:g} usual steps, the longest {self.longest_gap_ns / 1e9:.3f} s",
         }

@@ -170,11 +170,16 @@ def _idl_types(definition: str) -> Any:
     return types
 
 
+def distributions() -> dict[str, Stores]:
+    """The distributions of ROS 2 whose definitions are known, by name."""
+    return {store.name.partition("_")[2].lower(): store for store in Stores if store.name.startswith("ROS2_")}
+
+
 @lru_cache(maxsize=4)
 def _types_of_distribution(encoding: str, name: str = "") -> Any:
     if encoding == "ros1":
         return get_typestore(Stores.ROS1_NOETIC)
-    known = {store.name.partition("_")[2].lower(): store for store in Stores if store.name.startswith("ROS2_")}
+    known = distributions()
     if name and name.lower() not in known:
         raise MessageError(f"no distribution of ROS 2 is named {name!r}; known are {', '.join(sorted(known))}")
     return get_typestore(known[name.lower()] if name else Stores.LATEST)

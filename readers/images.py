@@ -294,13 +294,34 @@ def _raw_pixels(sample: ImageSample, raw: RawFormat) -> Pixels:
     return stored.view(order).astype(np.uint16, copy=False).reshape(shape)
 
 
-def _stored_rows(sample: ImageSample, row: int, rows: int) -> NDArray[np.uint8]:
-    """The bytes of a raw image without padding [rows, row]."""
+def check_stated(sample: ImageSample) -> None:
+    """Refuse an image that cannot be decoded by what is stated of it; its data are not looked at.
+
+    Raises:
+        ImageError: its encoding is not known, it has no pixels, or its rows do not fit into its step.
+    """
+    name = sample.encoding.lower()
+    if (raw := RAW_FORMATS.get(name)) is not None:
+        _step(sample, sample.width_px * raw.channels * raw.bits // 8)
+    elif name == "32fc1":
+        _step(sample, sample.width_px * 4)
+    elif not is_depth(name):
+        _check_format(sample)
+
+
+def _step(sample: ImageSample, row: int) -> int:
+    """The bytes from one stored row to the next, of which a row takes `row`."""
     if sample.width_px <= 0 or sample.height_px <= 0:
         raise _error(sample, f"its size is {sample.width_px} x {sample.height_px} px")
     step = sample.step_bytes or row
     if step < row:
         raise _error(sample, f"a row of {sample.width_px} px takes {row} bytes, but its step is {step} bytes")
+    return step
+
+
+def _stored_rows(sample: ImageSample, row: int, rows: int) -> NDArray[np.uint8]:
+    """The bytes of a raw image without padding [rows, row]."""
+    step = _step(sample, row)
     data = sample.data
     if len(data) < rows * step:
         raise _error(sample, f"{rows} rows of {step} bytes need {rows * step} bytes, but it holds {len(data)}")
@@ -325,9 +346,7 @@ def _decompress(sample: ImageSample, mode: int) -> Pixels:
     name = sample.encoding.lower()
     if is_depth(name) or name == "32fc1":
         raise _error(sample, "32FC1 and compressedDepth hold distances, not a picture; depth() reads them")
-    if _ALIASES.get(name, name) not in COMPRESSED_FORMATS:
-        known = ", ".join((*RAW_FORMATS, *COMPRESSED_FORMATS))
-        raise _error(sample, f"this encoding is not known; known are {known}")
+    _check_format(sample)
     data = sample.data
     if len(data) == 0:
         raise _error(sample, "it holds 0 bytes")
@@ -346,6 +365,13 @@ def _decompress(sample: ImageSample, mode: int) -> Pixels:
     if pixels.dtype not in (np.uint8, np.uint16):
         raise _error(sample, f"its pixels are {pixels.dtype}, neither 8 nor 16 bits")
     return cast("Pixels", pixels)
+
+
+def _check_format(sample: ImageSample) -> None:
+    name = sample.encoding.lower()
+    if _ALIASES.get(name, name) not in COMPRESSED_FORMATS:
+        known = ", ".join((*RAW_FORMATS, *COMPRESSED_FORMATS))
+        raise _error(sample, f"this encoding is not known; known are {known}")
 
 
 def _cut_short(data: bytes | memoryview) -> bool:

@@ -40,6 +40,7 @@ from readers.messages import (
 from readers.salvage import Loss
 from readers.sample_arrays import ARRAY_ROWS, StructuredArray, blank, gathered, reordered, row_type, rows_of, within
 from readers.streams import (
+    LATEST_NS,
     Camera,
     CameraInfo,
     Clock,
@@ -110,9 +111,10 @@ class Topic:
         """Where and when a message of the topic came."""
         return Arrival(
             self.name,
-            message.log_ns,
+            min(message.log_ns, LATEST_NS),
             self.trust_stamps,
-            published_ns=message.publish_ns,
+            ["late_log_time"] if message.log_ns > LATEST_NS else [],
+            published_ns=min(message.publish_ns, LATEST_NS),
             clock=self.clock,
             offset_ns=self.offset_ns,
         )
@@ -170,8 +172,8 @@ class Topic:
             stream = self.pairs[0].name if self.pairs else self.name
             yield Problem(
                 stream=stream,
-                t_ns=message.log_ns - self.lag_ns,
-                received_ns=message.log_ns,
+                t_ns=min(message.log_ns - self.lag_ns, LATEST_NS),
+                received_ns=min(message.log_ns, LATEST_NS),
                 kind=self.reader.kind,
                 reason=str(error),
             )

@@ -82,6 +82,7 @@ class Scan:
         self.summary = 0  # where the summary begins, 0 as long as the data go on
         self.stated: Statistics | None = None
         self.proofs = PROOF_BYTES
+        self.strange: list[tuple[int, int, McapBlock]] = []
 
     def run(self) -> None:
         """Walk from the first record to the end of the file."""
@@ -196,8 +197,9 @@ class Scan:
         """Compare the whole data section with its checksum where messages have none of their own."""
         stated = int.from_bytes(body[:4], "little")
         self.summed = stated != 0
-        if stated and self.unchecked and crc32(self.view[self.segment.start : at]) != stated:
-            text = f"the data do not match their checksum; {self.unchecked} messages have no other and may be wrong"
+        if stated and (self.unchecked or self.strange) and crc32(self.view[self.segment.start : at]) != stated:
+            bare = f"{self.unchecked} messages have" if self.unchecked else "messages may have"
+            text = f"the data do not match their checksum; {bare} no other and may be wrong"
             self.log.report(Cause.CHECKSUM, text, self.segment.start, self.segment.start)
         self.closed = True
 
@@ -205,9 +207,12 @@ class Scan:
         """The end of one file; where another one begins that was joined to it."""
         end = at + FOOTER.size - len(MAGIC)
         if self.view[end : end + len(MAGIC)] != MAGIC:
-            if end + len(MAGIC) <= self.size and not self.leads_on(end):
+            if end + len(MAGIC) > self.size:
+                return self.size
+            if not self.leads_on(end):
                 return self._passed_over(at)
-            return self.size
+            self.log.report(Cause.CUT, "the log goes on behind its footer", end, end)
+            return end
         self.closed = True
         self._take_statistics(at)
         end += len(MAGIC)
@@ -307,9 +312,15 @@ class Scan:
             self.log.report(what, fault, start, start)
         return self._count(start, end, block, unpacked.records, checked=bool(unpacked.crc) and not torn), end
 
-    def _count(self, start: int, end: int, block: McapBlock, records: memoryview, *, checked: bool) -> int:
+    def _count(
+        self, start: int, end: int, block: McapBlock, records: memoryview, *, checked: bool, last: bool = False
+    ) -> int:
+        """Count the messages of a block; one that has undescribed channels waits, as they may be described later."""
         self._describe_inside(start, records, sure=checked)
         walked = walk(records, self.segment, self.segment.channels)
+        if walked.strangers and not last and not block.torn:
+            self.strange.append((start, end, block))
+            return 0
         if walked.fault and not block.torn:
             self.log.report(Cause.CUT, walked.fault, start, start)
         if walked.strangers:
@@ -422,6 +433,7 @@ class Scan:
         They may be the inside of a chunk whose beginning is damaged, or other records that turned into messages.
         Where no other chunk tells whether that is so they are read, and it is said that nothing proves them.
         """
+        self._count_strange()
         loose, self.loose = self.loose, []
         damaged = len(self.log.losses) > self.losses or (self.fault and self._count_differs())
         if loose and self.chunked and damaged:
@@ -433,6 +445,14 @@ class Scan:
             text = f"{count} messages outside of chunks are read without a checksum and may be wrong"
             self.log.report(Cause.CHECKSUM, text, self.segment.start, self.segment.start)
         self.chunked = False
+
+    def _count_strange(self) -> None:
+        """Count the blocks whose channels were not described before them, now that all descriptions are known."""
+        strange, self.strange = self.strange, []
+        for start, end, block in strange:
+            unpacked = self.log.unpack(block)
+            checked = bool(unpacked.crc) and not block.torn
+            self._count(start, end, block, unpacked.records, checked=checked, last=True)
 
     def _count_differs(self) -> bool:
         """Whether the file states how many messages of each channel it holds, and others were found."""

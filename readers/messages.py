@@ -21,6 +21,7 @@ from readers.decoding import MessageError
 from readers.images import RAW_FORMATS, image_header, is_depth
 from readers.message_log import escaped
 from readers.streams import (
+    LATEST_NS,
     UNKNOWN_COV3,
     UNKNOWN_COV6,
     UNKNOWN_QUAT,
@@ -107,7 +108,7 @@ class Arrival:
                 t_ns = self.received_ns
         return Stamps(
             stream=self.stream,
-            t_ns=t_ns + self.offset_ns,
+            t_ns=min(t_ns + self.offset_ns, LATEST_NS),
             received_ns=self.received_ns,
             oddities=tuple(self.oddities),
             header_ns=header_ns,
@@ -126,8 +127,18 @@ def stamp_ns(stamp: Any) -> int:
     """Nanoseconds of a time stamp of ROS 1, ROS 2, Foxglove JSON or protobuf."""
     for seconds, nanoseconds in (("sec", "nanosec"), ("sec", "nsec"), ("seconds", "nanos"), ("secs", "nsecs")):
         if hasattr(stamp, seconds) and hasattr(stamp, nanoseconds):
-            return int(getattr(stamp, seconds)) * 1_000_000_000 + int(getattr(stamp, nanoseconds))
+            return _nanoseconds(getattr(stamp, seconds), getattr(stamp, nanoseconds))
     raise MessageError("the time stamp has no seconds and nanoseconds")
+
+
+def _nanoseconds(seconds: Any, rest: Any) -> int:
+    try:
+        found = int(seconds) * 1_000_000_000 + int(rest)
+    except (TypeError, ValueError, OverflowError) as error:
+        raise MessageError("the time stamp is no number") from error
+    if abs(found) > LATEST_NS:
+        raise MessageError(f"the time stamp of {found / 1e9:.3g} s does not fit into 64 bits")
+    return found
 
 
 def header_stamp(message: Any) -> Any:

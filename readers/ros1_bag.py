@@ -307,8 +307,7 @@ class Chunk:
         return sum(span.sum_ns for span in self.spans.values()) % 2**64
 
 
-@dataclass(frozen=True, eq=False)
-class ChunkIndex:
+class ChunkIndex(NamedTuple):
     """The index behind a chunk: its entries by connection; `complete` where another record follows it."""
 
     entries: dict[int, NDArray[np.void]]
@@ -319,14 +318,15 @@ class ChunkIndex:
         """Where the messages begin in the chunk."""
         return [place for entries in self.entries.values() for place in entries["place"].tolist()]
 
-    @cached_property
-    def spans(self) -> dict[int, Span]:
-        """What the chunk holds by connection."""
-        return {
+    @property
+    def outline(self) -> tuple[dict[int, Span], bool]:
+        """What the chunk holds by connection, and whether the index is complete; it takes little memory."""
+        spans = {
             number: Span.of(entries["seconds"] * _SECOND_NS + entries["rest"])
             for number, entries in self.entries.items()
             if len(entries)
         }
+        return spans, self.complete
 
 
 def index_behind(data: memoryview, chunk: Record) -> ChunkIndex:
@@ -551,11 +551,10 @@ class Ros1Log(MessageLog):
 
     def _list(self, records: list[Record], infos: dict[int, _ChunkInfo]) -> None:
         """Find out what each chunk holds: from its index where the chunk info agrees, else from itself."""
-        indexes = [index_behind(self._data, record) for record in records]
-        for record, index, info in zip(records, indexes, _infos_of(records, indexes, infos), strict=True):
-            spans = index.spans
+        indexes = [index_behind(self._data, record).outline for record in records]
+        for record, (spans, complete), info in zip(records, indexes, _infos_of(records, indexes, infos), strict=True):
             chunk, own = Chunk(record, spans), _ChunkInfo.of(spans)
-            believed = info == own if info else bool(spans) and index.complete
+            believed = info == own if info else bool(spans) and complete
             if record.torn or not believed or not chunk.spans.keys() <= self._by_id.keys():
                 chunk.spans = self._look_into(chunk, spans if believed else _announced(info))
             if chunk.spans:
@@ -781,7 +780,7 @@ def _announced(info: _ChunkInfo | None) -> dict[int, Span]:
 
 
 def _infos_of(
-    records: Sequence[Record], indexes: Sequence[ChunkIndex], infos: dict[int, _ChunkInfo]
+    records: Sequence[Record], indexes: Sequence[tuple[dict[int, Span], bool]], infos: dict[int, _ChunkInfo]
 ) -> list[_ChunkInfo | None]:
     """The chunk info of each chunk, which is taken out of `infos`: the one that agrees with its index, or its place's.
 
@@ -791,8 +790,8 @@ def _infos_of(
     places: dict[tuple[int, int, frozenset[tuple[int, int]]], list[int]] = {}
     for place, info in infos.items():
         places.setdefault(info.key, []).append(place)
-    for record, index in zip(records, indexes, strict=True):
-        agreeing = places.get(_ChunkInfo.of(index.spans).key, [])
+    for record, (spans, _) in zip(records, indexes, strict=True):
+        agreeing = places.get(_ChunkInfo.of(spans).key, [])
         found.append(None)
         if agreeing:
             place = agreeing.pop(agreeing.index(record.offset) if record.offset in agreeing else 0)

@@ -129,6 +129,16 @@ class ImageSample(Sample):
         """``image/jpeg`` or ``image/png`` where the stored bytes can be shown as they are, else None."""
         return {"jpeg": "image/jpeg", "png": "image/png"}.get(self.encoding)
 
+    def check(self) -> None:
+        """Refuse an image that cannot be decoded by what is stated of it, without a look at its data.
+
+        Raises:
+            ImageError: its encoding is not known, or its size and step are impossible.
+        """
+        from readers.images import check_stated
+
+        check_stated(self)
+
     def grey(self) -> NDArray[np.uint8] | NDArray[np.uint16]:
         """Decode to grey levels, shape [height, width], uint8 (uint16 for 16-bit encodings).
 
@@ -616,6 +626,8 @@ def array(*values: Any) -> FloatArray:
 
 
 UNKNOWN_QUAT = array(*[np.nan] * 4)
+LATEST_NS = 2**63 - 1
+"""The last moment that a sample can have; MCAP knows later ones, which are taken for it."""
 UNKNOWN_VEC3 = array(*[np.nan] * 3)
 UNKNOWN_COV6 = array(*[[np.nan] * 6] * 6)
 UNKNOWN_COV3 = array(*[[np.nan] * 3] * 3)

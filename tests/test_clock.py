@@ -117,6 +117,30 @@ def test_image_sizes_that_change_are_counted() -> None:
     assert counts(images) == {"size_change": 2}
 
 
+def test_images_that_cannot_be_decoded_are_counted_with_the_reason_of_the_first() -> None:
+    def image(encoding: str, width_px: int = 4, step_bytes: int = 0) -> ImageSample:
+        return ImageSample(
+            stream="/s",
+            t_ns=1,
+            received_ns=1,
+            encoding=encoding,
+            payload=b"",
+            width_px=width_px,
+            height_px=4,
+            step_bytes=step_bytes,
+        )
+
+    good = [image(name) for name in ("mono8", "YUYV", "jpeg", "JPG", "32FC1", "16UC1; compressedDepth png")]
+    assert "bad_image" not in counts(good)
+    bad = [image("zorro8"), image("mono8", width_px=0), image("bgr8", step_bytes=11), image("32FC1", step_bytes=15)]
+    audit = StreamAudit("/s")
+    for sample in [*good, *bad]:
+        audit.add(sample)
+    (fact,) = [fact for fact in audit.facts() if fact.code == "bad_image"]
+    assert fact.count == 4
+    assert "'zorro8': this encoding is not known; known are rgb8" in fact.sentence
+
+
 class Listed(Recording):
     """A recording of one readable and one unreadable stream."""
 

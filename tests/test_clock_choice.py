@@ -6,10 +6,10 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from made_logs import MS, ROS2, START_NS, Maker, drive, raw_ros, write_mcap
+from made_logs import MS, ROS2, START_NS, Maker, Raw, drive, raw_ros, write_mcap
 
 from readers import open_recording
-from readers.clock import SECOND_NS, StreamAudit, examine
+from readers.clock import SECOND_NS, StreamAudit, examine, survey
 from readers.log_recording import LogRecording
 from readers.message_log import Channel, Message
 from readers.streams import Clock, ReadOptions, Sample, ScalarSample, StreamError
@@ -215,3 +215,38 @@ def test_examine_gives_facts_and_audits(log: Path) -> None:
     with open_recording(log) as recording:
         found = examine(recording)
     assert found.audits["/imu"].lag == (200, 5 * MS, 5 * MS, 5 * MS)
+
+
+def test_times_that_64_bits_do_not_hold_are_told_and_stop_nothing(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    raws = list(raw_ros(drive(ROS2, 1.0), 2))
+    raws[7], raws[9] = raws[7]._replace(log_ns=2**63), raws[9]._replace(log_ns=2**64 - 1)
+    path = write_mcap(tmp_path / "late.mcap", raws, "ros2")
+    with open_recording(path) as recording:
+        samples = list(recording.read())
+        late = [sample for sample in samples if "late_log_time" in sample.oddities]
+        assert {(sample.t_ns, sample.received_ns) for sample in late} == {(2**63 - 1, 2**63 - 1)}
+        assert {fact.count for fact in survey(recording) if fact.code == "late_log_time"} <= {1, 2}
+    assert main(["inspect", str(path)]) == 0
+    assert "beyond the year 2262" in capsys.readouterr().out
+    assert main(["sync", str(path)]) == 3
+    assert main(["inspect", str(path), "--offset", "/imu=1e30"]) == 2
+    assert "no clock is a century off" in capsys.readouterr().err
+    assert main(["inspect", str(path), "--distro", "humbug"]) == 2
+    assert "must be one of dashing" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("seconds", ["1e400", "1e30", "null", '"soon"', "NaN", "[1]"])
+def test_a_stamp_in_json_that_is_no_time_spoils_its_message_only(tmp_path: Path, seconds: str) -> None:
+    def raw(i: int, stamp: str) -> Raw:
+        text = (
+            f'{{"timestamp": {{"sec": {stamp}, "nsec": 5}}, "frame_id": "cam", "format": "jpeg", "data": "/9j/2Q=="}}'
+        )
+        schema = ("foxglove.CompressedImage", "jsonschema", b"{}")
+        return Raw("/cam", schema, "json", START_NS + i * MS, text.encode())
+
+    raws = [raw(i, seconds if i == 12 else str(START_NS // 10**9)) for i in range(20)]
+    with open_recording(write_mcap(tmp_path / "a.mcap", raws)) as recording:
+        kinds = [type(sample).__name__ for sample in recording.read()]
+    assert kinds == ["ImageSample"] * 12 + ["Problem"] + ["ImageSample"] * 7

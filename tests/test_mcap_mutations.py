@@ -14,6 +14,18 @@ def small(request: pytest.FixtureRequest, tmp_path_factory: pytest.TempPathFacto
     return small_log(tmp_path_factory.mktemp("small") / "a.mcap", request.param)
 
 
+@pytest.mark.parametrize("codec", CODECS)
+def test_cuts_and_flips_of_a_file_without_an_index_lose_nothing_in_silence(tmp_path: Path, codec: str) -> None:
+    bare = small_log(tmp_path / "a.mcap", codec, index=False)
+    kinds = [
+        bare.data[:at] + bytes([bare.data[at] ^ 1 << bit]) + bare.data[at + 1 :] for at in (33,) for bit in range(8)
+    ]
+    for files, torn in ((cuts(bare, STEP), True), (flips(bare, STEP), False), (kinds, False)):
+        found = outcomes(tmp_path / "a.mcap", bare, files, torn=torn)
+        assert set(found) <= {"", "reported loss"}
+        assert found[""] > 0
+
+
 def test_every_cut_gives_only_what_was_written_and_is_said(tmp_path: Path, small: Small) -> None:
     found = outcomes(tmp_path / "a.mcap", small, cuts(small, STEP), torn=True)
     assert set(found) <= {"", "reported loss"}

@@ -52,6 +52,7 @@ if TYPE_CHECKING:
 
 
 MOST_FINDINGS = 5
+LONGEST_OFFSET_MS = 4e12  # beyond it times of today do not fit into 64 bits
 
 app = typer.Typer(
     name="workbench",
@@ -1278,6 +1279,10 @@ def _options(
         raise StreamError(f"--rate {rate:g}: a frame rate is a positive number of frames per second")
     if msg is not None and not msg.is_dir():
         raise StreamError(f"--msg {msg}: there is no such folder; give one of .msg files")
+    if distribution:
+        from readers.decoding import distributions
+
+        _one_of(distribution.lower(), tuple(distributions()), "--distro")
     pairs = []
     for text in frames or ():
         parent, comma, child = text.partition(",")
@@ -1331,10 +1336,14 @@ def _offsets(texts: Sequence[str]) -> tuple[tuple[str, int], ...]:
     for text in texts:
         topic, _, number = text.rpartition("=")
         try:
-            found[topic] = round(float(number) * 1e6)
-        except (ValueError, OverflowError):
-            topic = ""
-        if not topic:
+            milliseconds = float(number)
+        except ValueError:
+            milliseconds = float("nan")
+        if topic and abs(milliseconds) < LONGEST_OFFSET_MS:
+            found[topic] = round(milliseconds * 1e6)
+        elif topic and abs(milliseconds) >= LONGEST_OFFSET_MS:
+            raise StreamError(f"--offset {text}: no clock is a century off; give milliseconds, as sync does")
+        else:
             raise StreamError(f"--offset {text}: write a topic and milliseconds, such as --offset /camera=-12.5")
     return tuple(found.items())
 
