@@ -126,6 +126,15 @@ def mapper_of(**changes):
     return Mapper(Tracker(OPTICS, (flights.HEIGHT, flights.WIDTH), flights.settings(**changes)))
 
 
+def without_error(world):
+    """The map with the observations that its poses and points would give."""
+    exact, owner = world.seen.pixels.copy(), local_map.owners(world.seen)
+    for row, pose in enumerate(world.keyframes.cam_t_world):
+        at = world.seen.frame == row
+        exact[at] = local_map.projections(OPTICS, world.points.place[owner[at]], pose)[:, :2]
+    return world._replace(seen=world.seen._replace(pixels=exact))
+
+
 def posed_again(world, last, number=900):
     """The last frame of a flight as the mapping gets it, as if it came once more."""
     tracked = Tracker(OPTICS, (flights.HEIGHT, flights.WIDTH), SETTINGS).refined(world, last.pyramid, last.cam_t_world)
@@ -175,18 +184,12 @@ def test_the_bundle_takes_planted_errors_back_and_drops_a_false_view():
     _, world, _ = grown(bundle_keyframes=0)
     k = world.keyframes
     rng = np.random.default_rng(3)
-    # observations without error, of the map as it is
-    exact = world.seen.pixels.copy()
-    owner = local_map.owners(world.seen)
-    for row in range(len(k.number)):
-        at = world.seen.frame == row
-        exact[at] = local_map.projections(OPTICS, world.points.place[owner[at]], k.cam_t_world[row])[:, :2]
-    truth = world._replace(seen=world.seen._replace(pixels=exact))
+    truth, owner = without_error(world), local_map.owners(world.seen)
     poses = k.cam_t_world.copy()
     poses[-1] = se3_exp(np.array([0.01, -0.01, 0.005, 0.004, 0.002, -0.004])) @ poses[-1]
     views = np.diff(world.seen.first)
     false = int(np.flatnonzero((world.seen.frame == len(k.number) - 1) & (views[owner] > 2))[0])
-    pixels = exact.copy()
+    pixels = truth.seen.pixels.copy()
     pixels[false] += (15.0, -12.0)
     shaken = truth._replace(
         keyframes=k._replace(cam_t_world=poses),
@@ -207,6 +210,29 @@ def test_the_bundle_takes_planted_errors_back_and_drops_a_false_view():
     assert int(k.number[-1]) not in told(after).get(number, {})
     again = mapper._bundled(after)[0].keyframes.cam_t_world[-1]  # without it nothing is left of the error
     assert np.linalg.norm(local_map.centre_of(again) - local_map.centre_of(k.cam_t_world[-1])) < 1e-6
+
+
+def test_keyframes_beyond_the_bundle_are_held_and_their_views_count():
+    truth = without_error(grown(60)[1])
+    inside = mapping.sharing_keyframes(truth, 4)
+    assert len(truth.keyframes.number) > len(inside) == 4
+    noise = np.random.default_rng(4).normal(0, 0.3, truth.seen.pixels.shape)
+    noisy = truth._replace(seen=truth.seen._replace(pixels=truth.seen.pixels + noise))
+    without = local_map.with_observations(noisy, np.isin(noisy.seen.frame, inside))
+    of_inside = np.unique(local_map.owners(truth.seen)[np.isin(truth.seen.frame, inside)])
+    points = of_inside[np.diff(truth.seen.first)[of_inside] > 1]
+    error = {}
+    for name, world in {"all": noisy, "inside": without}.items():
+        after, bundle, taking_part, _ = mapper_of(bundle_keyframes=4, bundle_iterations=60)._bundled(world)
+        assert taking_part == 4
+        held = np.setdiff1d(np.arange(len(truth.keyframes.number)), inside[2:])
+        assert np.array_equal(after.keyframes.cam_t_world[held], truth.keyframes.cam_t_world[held])
+        rows = local_map.rows_of(after.points.number, truth.points.number[points])
+        off = np.linalg.norm(after.points.place[rows] - truth.points.place[points], axis=1)[rows >= 0]
+        error[name] = np.sqrt(np.mean(off**2))
+        if name == "all":
+            assert len(bundle.error_px) == np.diff(truth.seen.first)[points].sum()
+    assert error["all"] < 0.8 * error["inside"]
 
 
 def test_a_keyframe_sees_all_points_in_its_view_and_has_its_pose_by_them():

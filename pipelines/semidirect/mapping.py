@@ -309,15 +309,21 @@ class Mapper:
         return world._replace(points=refined), len(rows)
 
     def _bundled(self, world: LocalMap) -> tuple[LocalMap, Bundle | None, int, int]:
-        """Local bundle adjustment over the last keyframe and those that share most points with it."""
-        rows = sharing_keyframes(world, self.settings.bundle_keyframes)
-        inside = np.isin(world.seen.frame, rows)
-        owner = owners(world.seen)
-        views = np.bincount(owner[inside], minlength=len(world.points.number))
-        points = np.flatnonzero(views > 1)
-        if len(rows) < 3 or len(points) < LEAST_POINTS:
+        """Local bundle adjustment over the last keyframe and those that share most points with it.
+
+        All views of their points count: keyframes beyond these are held as they are, and so are the two oldest.
+        """
+        sharing = sharing_keyframes(world, self.settings.bundle_keyframes)
+        inside, owner = np.isin(world.seen.frame, sharing), owners(world.seen)
+        takes_part = np.zeros(len(world.points.number), np.bool_)
+        takes_part[owner[inside]] = True
+        takes_part &= np.diff(world.seen.first) > 1
+        points = np.flatnonzero(takes_part)
+        if len(sharing) < 3 or len(points) < LEAST_POINTS:
             return world, None, 0, 0
-        which = np.flatnonzero(inside & (views > 1)[owner])
+        which = np.flatnonzero(takes_part[owner])
+        rows = np.unique(world.seen.frame[which])
+        fixed = ~np.isin(rows, sharing[2:])
         local = observations_of(
             np.searchsorted(points, owner[which]),
             np.searchsorted(rows, world.seen.frame[which]),
@@ -328,7 +334,7 @@ class Mapper:
         done = refinement.adjust(
             self.optics,
             world.keyframes.cam_t_world[rows],
-            refinement.oldest_fixed(len(rows)),
+            fixed,
             local,
             world.points.place[points],
             self._bundle,
@@ -342,7 +348,7 @@ class Mapper:
         stays[which[~done.inlier]] = False
         world = with_observations(world, stays)
         orphans = np.diff(world.seen.first) == 0
-        return without_points(world, orphans), done, len(rows), int(np.count_nonzero(orphans))
+        return without_points(world, orphans), done, len(sharing), int(np.count_nonzero(orphans))
 
 
 # ---------------------------------------------------------------------------------- helpers
