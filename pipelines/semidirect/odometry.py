@@ -369,6 +369,7 @@ class SemidirectOdometry:
             watch=ScaleWatch(),
         )
         fields = fields | track_fields(sighted, world) | map_fields(world) | {"keyframe": 1, "accepted": True}
+        fields |= dict.fromkeys(("keyframe_points", "points_refined"), len(world.points.number))
         if self._beside is not None:
             self._beside.begin(world)
         return Met(new, Stage.STARTED, alarms, fields)
