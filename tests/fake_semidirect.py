@@ -138,6 +138,7 @@ def _step(rng: np.random.Generator, frame: int, points: NDArray[np.float64], sca
         "pose_covariance": np.eye(6) * 1e-6,
         "keyframe_distance": 0.01 * (frame % 12),
         "keyframe_removed": -1,
+        "keyframe_points": 100,
         "points_refined": 20,
         "points_added": 7 * made,
         "points_removed": rng.integers(0, 3, 3),

@@ -9,7 +9,7 @@ from hypothesis import strategies as st
 
 from pipelines import lens
 from pipelines.geometry import se3_exp, se3_inverse
-from pipelines.semidirect import local_map, mapping, relocalisation
+from pipelines.semidirect import local_map, mapping, refinement, relocalisation
 from pipelines.semidirect.beside import Beside
 from pipelines.semidirect.local_map import Keyframes, LocalMap, PointState, Sightings
 from pipelines.semidirect.mapping import Mapper, Posed
@@ -122,6 +122,29 @@ def grown(last=40, **changes):
     return Tracker(OPTICS, (flights.HEIGHT, flights.WIDTH), flights.settings(**changes)), state.world, state.last
 
 
+def mapper_of(**changes):
+    return Mapper(Tracker(OPTICS, (flights.HEIGHT, flights.WIDTH), flights.settings(**changes)))
+
+
+def without_error(world):
+    """The map with the observations that its poses and points would give."""
+    exact, owner = world.seen.pixels.copy(), local_map.owners(world.seen)
+    for row, pose in enumerate(world.keyframes.cam_t_world):
+        at = world.seen.frame == row
+        exact[at] = local_map.projections(OPTICS, world.points.place[owner[at]], pose)[:, :2]
+    return world._replace(seen=world.seen._replace(pixels=exact))
+
+
+def posed_again(world, last, number=900):
+    """The last frame of a flight as the mapping gets it, as if it came once more."""
+    tracked = Tracker(OPTICS, (flights.HEIGHT, flights.WIDTH), SETTINGS).refined(world, last.pyramid, last.cam_t_world)
+    rows, pixels, level = tracked.sightings
+    missed = np.zeros(0, np.int64)
+    return Posed(
+        number, last.pyramid, tracked.cam_t_world, world.points.number[rows], pixels, level, missed, tracked.depth
+    )
+
+
 def test_points_of_the_filters_lie_on_the_ground():
     _, world, _ = grown()
     fresh = world.points.state == PointState.CANDIDATE
@@ -161,25 +184,19 @@ def test_the_bundle_takes_planted_errors_back_and_drops_a_false_view():
     _, world, _ = grown(bundle_keyframes=0)
     k = world.keyframes
     rng = np.random.default_rng(3)
-    # observations without error, of the map as it is
-    exact = world.seen.pixels.copy()
-    owner = local_map.owners(world.seen)
-    for row in range(len(k.number)):
-        at = world.seen.frame == row
-        exact[at] = local_map.projections(OPTICS, world.points.place[owner[at]], k.cam_t_world[row])[:, :2]
-    truth = world._replace(seen=world.seen._replace(pixels=exact))
+    truth, owner = without_error(world), local_map.owners(world.seen)
     poses = k.cam_t_world.copy()
     poses[-1] = se3_exp(np.array([0.01, -0.01, 0.005, 0.004, 0.002, -0.004])) @ poses[-1]
     views = np.diff(world.seen.first)
     false = int(np.flatnonzero((world.seen.frame == len(k.number) - 1) & (views[owner] > 2))[0])
-    pixels = exact.copy()
+    pixels = truth.seen.pixels.copy()
     pixels[false] += (15.0, -12.0)
     shaken = truth._replace(
         keyframes=k._replace(cam_t_world=poses),
         points=world.points._replace(place=world.points.place + rng.normal(0, 0.002, world.points.place.shape)),
         seen=truth.seen._replace(pixels=pixels),
     )
-    mapper = Mapper(OPTICS, flights.settings(bundle_keyframes=len(k.number), max_keyframes=30, bundle_iterations=60))
+    mapper = mapper_of(bundle_keyframes=len(k.number), max_keyframes=30, bundle_iterations=60)
     after, bundle, taking_part, _ = mapper._bundled(shaken)
     assert bundle is not None
     assert taking_part >= 3
@@ -195,9 +212,82 @@ def test_the_bundle_takes_planted_errors_back_and_drops_a_false_view():
     assert np.linalg.norm(local_map.centre_of(again) - local_map.centre_of(k.cam_t_world[-1])) < 1e-6
 
 
+def test_keyframes_beyond_the_bundle_are_held_and_their_views_count():
+    truth = without_error(grown(60)[1])
+    inside = mapping.sharing_keyframes(truth, 4)
+    assert len(truth.keyframes.number) > len(inside) == 4
+    noise = np.random.default_rng(4).normal(0, 0.3, truth.seen.pixels.shape)
+    noisy = truth._replace(seen=truth.seen._replace(pixels=truth.seen.pixels + noise))
+    without = local_map.with_observations(noisy, np.isin(noisy.seen.frame, inside))
+    of_inside = np.unique(local_map.owners(truth.seen)[np.isin(truth.seen.frame, inside)])
+    points = of_inside[np.diff(truth.seen.first)[of_inside] > 1]
+    error = {}
+    for name, world in {"all": noisy, "inside": without}.items():
+        after, bundle, taking_part, _ = mapper_of(bundle_keyframes=4, bundle_iterations=60)._bundled(world)
+        assert taking_part == 4
+        held = np.setdiff1d(np.arange(len(truth.keyframes.number)), inside[2:])
+        assert np.array_equal(after.keyframes.cam_t_world[held], truth.keyframes.cam_t_world[held])
+        rows = local_map.rows_of(after.points.number, truth.points.number[points])
+        off = np.linalg.norm(after.points.place[rows] - truth.points.place[points], axis=1)[rows >= 0]
+        error[name] = np.sqrt(np.mean(off**2))
+        if name == "all":
+            assert len(bundle.error_px) == np.diff(truth.seen.first)[points].sum()
+    assert error["all"] < 0.8 * error["inside"]
+
+
+def test_a_keyframe_sees_all_points_in_its_view_and_has_its_pose_by_them():
+    _, world, last = grown()
+    posed = posed_again(world, last)
+    pose, sightings = mapper_of()._sighted(world, posed)
+    expected = local_map.projections(OPTICS, world.points.place, pose)
+    edge = np.array([flights.WIDTH, flights.HEIGHT]) - 12
+    inside = np.flatnonzero(((expected[:, :2] >= 12) & (expected[:, :2] < edge)).all(axis=1))
+    assert len(sightings.rows) > 1.4 * len(posed.found)
+    assert np.isin(inside, sightings.rows).mean() > 0.9
+    assert np.all(np.diff(sightings.rows) > 0)
+    error = sightings.pixels - expected[sightings.rows, :2]
+    assert np.linalg.norm(error, axis=1).max() <= 2 * SETTINGS.inlier_px
+    alone = refinement.refine_pose(
+        OPTICS, world.points.place[sightings.rows], sightings.pixels, sightings.level, pose, refinement.PoseOptions()
+    )
+    assert np.abs(alone.cam_t_world - pose).max() < 1e-6  # nothing is left to gain
+
+
+def test_a_keyframe_without_more_points_keeps_what_tracking_found():
+    _, world, last = grown()
+    posed = posed_again(world, last)
+    blank = pyramid_of(np.full((flights.HEIGHT, flights.WIDTH), 90, np.uint8))
+    for mapper, frame in ((mapper_of(), posed._replace(pyramid=blank)), (mapper_of(keyframe_points="tracked"), posed)):
+        pose, sightings = mapper._sighted(world, frame)
+        assert np.array_equal(pose, posed.cam_t_world)
+        assert np.array_equal(world.points.number[sightings.rows], posed.found)
+        assert np.array_equal(sightings.pixels, posed.pixels)
+
+
+def test_points_of_a_keyframe_are_refined_at_once():
+    _, world, last = grown()
+    rng = np.random.default_rng(8)
+    moved = world._replace(
+        points=world.points._replace(place=world.points.place + rng.normal(0, 0.002, world.points.place.shape))
+    )
+    growth = mapper_of(keyframe_distance=1e-9, max_keyframes=30).grown(moved, posed_again(world, last))
+    after = growth.world
+    seen_by_last = local_map.owners(after.seen)[after.seen.frame == len(after.keyframes.number) - 1]
+    rows = seen_by_last[np.diff(after.seen.first)[seen_by_last] > 1]
+    assert growth.keyframe
+    assert growth.sighted == len(seen_by_last)
+    assert growth.refined == len(rows) > 80
+    again = refinement.refine_points(
+        OPTICS, after.keyframes.cam_t_world, mapping._observations_of_points(after.seen, rows),
+        after.points.place[rows], 5,
+    )  # fmt: skip
+    assert np.abs(again.points - after.points.place[rows]).max() < 1e-6  # nothing is left to gain
+    assert np.isfinite(after.points.covariance[rows]).all()
+
+
 def test_points_that_are_not_found_again_go():
     _, world, last = grown()
-    mapper = Mapper(OPTICS, flights.settings(point_failures=2, candidate_failures=4))
+    mapper = mapper_of(point_failures=2, candidate_failures=4)
     known = world.points.number[world.points.state >= PointState.KNOWN][:5]
     fresh = world.points.number[world.points.state == PointState.CANDIDATE][:5]
     posed = Posed(

@@ -34,8 +34,21 @@ def test_path_is_the_true_one(changes):
     assert [s.stage for s in steps].count(Stage.STARTED) == 1
     assert all(s.stage == Stage.TRACKED for s in steps if s.map_number == 0 and s.stage != Stage.STARTED)
     error, scale = flights.path_error(steps)
-    assert error < 1.5e-3
+    assert error < 5e-4
     assert abs(scale - 1) < 0.02  # the height gives it
+    if not changes:
+        few = flights.flight(FRAMES, keyframe_points="tracked")
+        assert error < 0.9 * flights.path_error(few)[0]
+        assert max(s.keyframe_points for s in few[-30:]) <= flights.settings().max_features
+
+
+def test_a_keyframe_is_told_with_the_points_that_it_sees():
+    steps = [s for s in flights.flight(FRAMES) if s.accepted]
+    for step in steps:
+        assert (step.keyframe_points > 0) == (step.points_refined > 0) == bool(step.keyframe)
+        assert step.points_refined <= step.keyframe_points
+        assert step.keyframe_points >= step.tracked * step.keyframe
+    assert steps[-1].map_points > 2 * steps[-1].tracked
 
 
 @pytest.mark.parametrize("through", ["radial-tangential", "equidistant"])

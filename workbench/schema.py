@@ -412,6 +412,7 @@ SEMIDIRECT = Schema(
             title="P"),
         Row("keyframe_distance", "keyframe/distance", title="distance / depth"),
         Row("keyframe_removed", "keyframe/removed", title="removed"),
+        Row("keyframe_points", "keyframe/points", title="points"),
         Row("points_refined", "structure/refined", title="refined"),
         Row("points_added", "structure/changed", title="added"),
         Row("points_removed", "structure/changed", axes=("with keyframe", "not found", "outlier"), title="removed"),

@@ -48,8 +48,7 @@ class Points(NamedTuple):
 
     `number` [P] ascending; `place` [P, 3] in the world with its `covariance` [P, 3, 3] for errors of 1 px, NaN
     while unknown; `sigma` [P] along the ray of the first view; `state` [P] a
-    `PointState`; `found` [P] frames that found it, `missed` [P] frames in a row that did not; `stale` [P]: 1 where
-    its views changed since it was last refined.
+    `PointState`; `found` [P] frames that found it, `missed` [P] frames in a row that did not.
     """
 
     number: Longs
@@ -59,7 +58,6 @@ class Points(NamedTuple):
     state: Longs
     found: Longs
     missed: Longs
-    stale: Longs
 
 
 class Filters(NamedTuple):
@@ -116,7 +114,7 @@ def no_filters() -> Filters:
 def new_points(number: Longs, place: Floats, covariance: Floats, sigma: Floats, state: PointState) -> Points:
     """Points that no frame has looked for yet."""
     zeros = np.zeros(len(number), np.int64)
-    return Points(number, place, covariance, sigma, np.full(len(number), int(state)), zeros, zeros, zeros)
+    return Points(number, place, covariance, sigma, np.full(len(number), int(state)), zeros, zeros)
 
 
 def rows_of(numbers: Longs, wanted: Longs) -> Longs:
@@ -172,10 +170,9 @@ def with_keyframe(
         np.concatenate([seen.level, sightings.level]),
         len(world.points.number),
     )
-    state, stale = world.points.state.copy(), world.points.stale.copy()
+    state = world.points.state.copy()
     state[rows] = np.maximum(state[rows], PointState.KNOWN)
-    stale[rows] = 1
-    return world._replace(keyframes=keyframes, points=world.points._replace(state=state, stale=stale), seen=found)
+    return world._replace(keyframes=keyframes, points=world.points._replace(state=state), seen=found)
 
 
 def without_keyframe(world: LocalMap, row: int) -> tuple[LocalMap, int]:

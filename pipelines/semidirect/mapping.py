@@ -34,10 +34,10 @@ from pipelines.semidirect.local_map import (
     without_keyframe,
     without_points,
 )
-from pipelines.semidirect.optics import Optics, rays
+from pipelines.semidirect.optics import rays
 from pipelines.semidirect.pyramid import Pyramid
 from pipelines.semidirect.refinement import Bundle, BundleOptions, Observations
-from pipelines.semidirect.settings import SemidirectSettings
+from pipelines.semidirect.tracking import Tracker
 
 Floats = NDArray[np.float64]
 Longs = NDArray[np.int64]
@@ -86,14 +86,16 @@ class Watched(NamedTuple):
 class Growth(NamedTuple):
     """What a frame did to the map.
 
-    `keyframe` says whether it became one, `cam_t_world` [4, 4] its pose after that; `distance` to the nearest keyframe
-    before, over the depth. `removed` [3]: points that went with their keyframe, that were not found again, outliers
-    of the bundle adjustment. `filter_count` [6] by `depth_filter.Outcome`, and those given up.
+    `keyframe` says whether it became one, `cam_t_world` [4, 4] its pose after that, `sighted` the points that it sees
+    as a keyframe; `distance` to the nearest keyframe before, over the depth. `removed` [3]: points that went with
+    their keyframe, that were not found again, outliers of the bundle adjustment. `filter_count` [6] by
+    `depth_filter.Outcome`, and those given up.
     """
 
     world: LocalMap
     keyframe: bool
     cam_t_world: Floats
+    sighted: int
     distance: float
     keyframe_removed: int
     refined: int
@@ -109,13 +111,12 @@ class Mapper:
     """Grows the map of one camera.
 
     Args:
-        optics: the camera.
-        settings: all settings.
+        tracker: finds the map's points in a keyframe; the camera and all settings are its.
     """
 
-    def __init__(self, optics: Optics, settings: SemidirectSettings) -> None:
-        s = settings
-        self.optics, self.settings = optics, s
+    def __init__(self, tracker: Tracker) -> None:
+        s = tracker.settings
+        self.optics, self.settings, self._tracker = tracker.optics, s, tracker
         self._corners = CornerOptions(s.cell_px, s.corner_threshold, s.corner_min_score)
         self._limits = epipolar.Limits(worst_score=s.epipolar_score)
         self._bundle = BundleOptions(s.bundle_iterations, s.bundle_huber_px, inlier_px=s.inlier_px)
@@ -129,22 +130,25 @@ class Mapper:
         world, watched, added, filter_count = self._filtered(world, posed)
         distance = nearest_keyframe(world, posed.cam_t_world) / posed.depth
         keyframe = bool(distance > self.settings.keyframe_distance)
-        bundle, taking_part, dropped, pose = None, 0, -1, posed.cam_t_world
+        bundle, taking_part, dropped, pose, sighted, refined = None, 0, -1, posed.cam_t_world, 0, 0
         if keyframe:
-            world = with_keyframe(world, posed.number, pose, posed.pyramid, sightings_of(world, posed))
+            pose, sightings = self._sighted(world, posed)
+            sighted = len(sightings.rows)
+            world = with_keyframe(world, posed.number, pose, posed.pyramid, sightings)
             if self.settings.bundle_keyframes:
                 world, bundle, taking_part, removed[2] = self._bundled(world)
                 pose = world.keyframes.cam_t_world[-1]
+            world, refined = self._refined(world)
             if len(world.keyframes.number) > self.settings.max_keyframes:
                 world, dropped, removed[0] = _without_farthest(world, pose)
             world, gone = self._without_old_filters(world)
             filter_count[GIVEN_UP] += gone
             world = self.with_filters(world, posed.pyramid, posed.depth)
-        world, refined = self._refined(world, posed.found)
         return Growth(
             world=world,
             keyframe=keyframe,
             cam_t_world=pose,
+            sighted=sighted,
             distance=distance,
             keyframe_removed=dropped,
             refined=refined,
@@ -171,6 +175,10 @@ class Mapper:
         return without_points(world, gone), int(np.count_nonzero(gone))
 
     # ---------------------------------------------------------------------------- filters
+
+    def begun(self, world: LocalMap, pyramid: Pyramid, depth: float) -> LocalMap:
+        """The first map with its points refined, and filters for its last keyframe."""
+        return self.with_filters(self._refined(world)[0], pyramid, depth)
 
     def with_filters(self, world: LocalMap, pyramid: Pyramid, depth: float) -> LocalMap:
         """The map with a filter for the best corner of each cell of the last keyframe that has no point."""
@@ -265,37 +273,57 @@ class Mapper:
 
     # ---------------------------------------------------------------------------- refinement
 
-    def _refined(self, world: LocalMap, found: Longs) -> tuple[LocalMap, int]:
-        """Points of the frame whose views changed are refined on their own, so many a frame."""
+    def _sighted(self, world: LocalMap, posed: Posed) -> tuple[Floats, Sightings]:
+        """The pose [4, 4] of a new keyframe and the points that it sees.
+
+        All points of the map in its view are looked for, and the pose is by all that were found: every later frame
+        and filter builds upon it, and tracking needs too few points for that. Where this finds fewer than tracking
+        did, what tracking found holds.
+        """
+        tracked = sightings_of(world, posed)
+        if self.settings.keyframe_points == "tracked":
+            return posed.cam_t_world, tracked
+        again = self._tracker.refined(world, posed.pyramid, posed.cam_t_world, every=True)
+        if again.points < len(tracked.rows):
+            return posed.cam_t_world, tracked
+        return again.cam_t_world, again.sightings
+
+    def _refined(self, world: LocalMap) -> tuple[LocalMap, int]:
+        """All points that the last keyframe sees are refined on their own, by all of their views."""
         points, seen = world.points, world.seen
-        rows = rows_of(points.number, found)
-        rows = rows[rows >= 0]
-        rows = rows[(points.stale[rows] == 1) & (np.diff(seen.first)[rows] > 1)][: self.settings.refine_points]
+        of_last = owners(seen)[seen.frame == len(world.keyframes.number) - 1]
+        rows = of_last[np.diff(seen.first)[of_last] > 1]
         if not len(rows):
             return world, 0
         chosen = _observations_of_points(seen, rows)
         done = refinement.refine_points(
             self.optics, world.keyframes.cam_t_world, chosen, points.place[rows], self.settings.refine_iterations
         )
-        place, sigma, stale = points.place.copy(), points.sigma.copy(), points.stale.copy()
-        place[rows], stale[rows] = done.points, 0
+        place, sigma = points.place.copy(), points.sigma.copy()
+        place[rows] = done.points
         sigma[rows] = _along_ray(done.covariance, done.points, world, rows, sigma[rows])
         covariance = points.covariance.copy()
         told = np.isfinite(done.covariance).all(axis=(1, 2))
         covariance[rows[told]] = done.covariance[told]
-        refined = points._replace(place=place, covariance=covariance, sigma=sigma, stale=stale)
+        refined = points._replace(place=place, covariance=covariance, sigma=sigma)
         return world._replace(points=refined), len(rows)
 
     def _bundled(self, world: LocalMap) -> tuple[LocalMap, Bundle | None, int, int]:
-        """Local bundle adjustment over the last keyframe and those that share most points with it."""
-        rows = sharing_keyframes(world, self.settings.bundle_keyframes)
-        inside = np.isin(world.seen.frame, rows)
-        owner = owners(world.seen)
-        views = np.bincount(owner[inside], minlength=len(world.points.number))
-        points = np.flatnonzero(views > 1)
-        if len(rows) < 3 or len(points) < LEAST_POINTS:
+        """Local bundle adjustment over the last keyframe and those that share most points with it.
+
+        All views of their points count: keyframes beyond these are held as they are, and so are the two oldest.
+        """
+        sharing = sharing_keyframes(world, self.settings.bundle_keyframes)
+        inside, owner = np.isin(world.seen.frame, sharing), owners(world.seen)
+        takes_part = np.zeros(len(world.points.number), np.bool_)
+        takes_part[owner[inside]] = True
+        takes_part &= np.diff(world.seen.first) > 1
+        points = np.flatnonzero(takes_part)
+        if len(sharing) < 3 or len(points) < LEAST_POINTS:
             return world, None, 0, 0
-        which = np.flatnonzero(inside & (views > 1)[owner])
+        which = np.flatnonzero(takes_part[owner])
+        rows = np.unique(world.seen.frame[which])
+        fixed = ~np.isin(rows, sharing[2:])
         local = observations_of(
             np.searchsorted(points, owner[which]),
             np.searchsorted(rows, world.seen.frame[which]),
@@ -306,7 +334,7 @@ class Mapper:
         done = refinement.adjust(
             self.optics,
             world.keyframes.cam_t_world[rows],
-            refinement.oldest_fixed(len(rows)),
+            fixed,
             local,
             world.points.place[points],
             self._bundle,
@@ -320,7 +348,7 @@ class Mapper:
         stays[which[~done.inlier]] = False
         world = with_observations(world, stays)
         orphans = np.diff(world.seen.first) == 0
-        return without_points(world, orphans), done, len(rows), int(np.count_nonzero(orphans))
+        return without_points(world, orphans), done, len(sharing), int(np.count_nonzero(orphans))
 
 
 # ---------------------------------------------------------------------------------- helpers

@@ -257,7 +257,7 @@ class SemidirectOdometry:
         except ValueError as error:
             raise EstimatorError(str(error)) from error
         self._tracker = Tracker(optics, (height, width), self._settings)
-        self._mapper = Mapper(optics, self._settings)
+        self._mapper = Mapper(self._tracker)
         if self._settings.mapping == "beside":
             self._beside = Beside(self._mapper)
 
@@ -347,7 +347,7 @@ class SemidirectOdometry:
             heading_rad=heading + s.mounting_yaw_rad,
             next_number=0 if state.world is None else state.world.next_number,
         )
-        world = self._mapper.with_filters(first.world, pyramid, first.depth)
+        world = self._mapper.begun(first.world, pyramid, first.depth)
         sighted = self._tracker.refined(world, pyramid, world.keyframes.cam_t_world[-1])
         scale, alarms = self._scale_at_start(state, first.unit), Verdict.OK
         again = state.map_number >= 0
@@ -369,6 +369,7 @@ class SemidirectOdometry:
             watch=ScaleWatch(),
         )
         fields = fields | track_fields(sighted, world) | map_fields(world) | {"keyframe": 1, "accepted": True}
+        fields |= dict.fromkeys(("keyframe_points", "points_refined"), len(world.points.number))
         if self._beside is not None:
             self._beside.begin(world)
         return Met(new, Stage.STARTED, alarms, fields)

@@ -113,11 +113,13 @@ class SemidirectSettings(CameraSettings):
     # refinement
     pose_iterations: Count = Field(10, description="most iterations of the pose refinement")
     inlier_px: Positive = Field(2.0, description="a point with a larger reprojection error is dropped from the frame")
-    refine_points: Annotated[int, Field(ge=0)] = Field(20, description="points refined on their own with each frame")
-    refine_iterations: Count = Field(5, description="iterations of each")
+    refine_iterations: Count = Field(5, description="iterations of each point that a keyframe sees, on its own")
 
     # keyframes
     keyframe_distance: Positive = Field(0.12, description="a keyframe is farther from all others, in scene depths")
+    keyframe_points: Literal["all", "tracked"] = Field(
+        "all", description="points that a keyframe sees: all of the map in its view, or those that tracking found"
+    )
     max_keyframes: Annotated[int, Field(ge=3)] = Field(10, description="keyframes in the map")
 
     # local bundle adjustment

@@ -155,7 +155,6 @@ def first_map(
         n,
     )
     table = new_points(next_number + rows, places, np.full((n, 3, 3), np.nan), sigma, PointState.KNOWN)
-    table = table._replace(stale=np.ones(n, np.int64))
     world = LocalMap(keyframes, table, seen, no_filters(), next_number + n)
     return FirstMap(world, float(np.median(points[:, 2])) * unit, unit)
 

@@ -154,9 +154,10 @@ class SemidirectStep(VisualStep):
     # 4. keyframe decision
     keyframe_distance: float = quantity("1", "distance to the nearest keyframe over the scene's depth")
     keyframe_removed: int = quantity("1", "number of the keyframe that went, -1 for none")
+    keyframe_points: int = quantity("1", "map points that the frame sees as a keyframe, 0 where it is none")
 
     # 5. structure: points refined, added, removed
-    points_refined: int = quantity("1", "points refined on their own")
+    points_refined: int = quantity("1", "points of the keyframe, refined on their own")
     points_added: int = quantity("1", "points that the depth filters gave to the map")
     points_removed: Longs = quantity("1", "points that went: keyframe gone, not found again, outlier of bundle", 3)
 

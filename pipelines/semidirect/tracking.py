@@ -135,9 +135,12 @@ class Tracker:
             return None, px
         return alignment.align(last.pyramid, frame, self.optics, px, points, prior, self._levels), px
 
-    def refined(self, world: LocalMap, frame: Pyramid, start: Floats) -> Tracked:
-        """The pose of a frame that is about right already: features aligned, pose refined."""
-        looked = self._look(world, frame, start)
+    def refined(self, world: LocalMap, frame: Pyramid, start: Floats, *, every: bool = False) -> Tracked:
+        """The pose of a frame that is about right already: features aligned, pose refined.
+
+        By one point a cell and `max_features` in all, or by every point that the frame lets be expected in its view.
+        """
+        looked = self._look(world, frame, start, every)
         found, outcome = looked.features, looked.outcome
         good = np.flatnonzero(outcome == Feature.MATCHED)
         error_px = np.full(len(outcome), np.nan)
@@ -167,18 +170,18 @@ class Tracker:
             depth=float(np.median(depth)) if len(depth) else np.nan,
         )
 
-    def _look(self, world: LocalMap, frame: Pyramid, pose: Floats) -> Looked:
+    def _look(self, world: LocalMap, frame: Pyramid, pose: Floats, every: bool) -> Looked:
         """Look for the map's points around where the pose lets them be expected."""
         points, keyframes, seen = world.points, world.keyframes, world.seen
         places = projections(self.optics, points.place, pose)
         u, v = places[:, 0], places[:, 1]
         inside = (u >= EDGE_PX) & (u < frame.width - EDGE_PX) & (v >= EDGE_PX) & (v < frame.height - EDGE_PX)
         rows = np.flatnonzero(inside)
-        side = self.settings.cell_px
-        cell = (v[rows] // side).astype(np.int64) * self._columns + (u[rows] // side).astype(np.int64)
-        views = np.minimum(np.diff(seen.first)[rows], VIEWS_COUNTED - 1)
-        worth = points.state[rows] * VIEWS_COUNTED + views
-        order = np.argsort(self._turn[cell] * 4 * VIEWS_COUNTED - worth, kind="stable")
+        if every:
+            cell, wanted = np.arange(len(rows)), len(rows)
+        else:
+            rows, cell = self._served(world, rows, u[rows], v[rows])
+            wanted = self.settings.max_features
         rows, found = find_points(
             keyframes.grey,
             frame,
@@ -189,12 +192,21 @@ class Tracker:
             centre_of(pose),
             points.place,
             seen,
-            rows[order],
-            cell[order],
-            self.settings.max_features,
+            rows,
+            cell,
+            wanted,
             self._features,
         )
         return Looked(rows, found, found.outcome.copy())
+
+    def _served(self, world: LocalMap, rows: Longs, u: Floats, v: Floats) -> tuple[Longs, Longs]:
+        """Rows of points in the order in which they are looked for, cell by cell, the best first; and their cells."""
+        side = self.settings.cell_px
+        cell = (v // side).astype(np.int64) * self._columns + (u // side).astype(np.int64)
+        views = np.minimum(np.diff(world.seen.first)[rows], VIEWS_COUNTED - 1)
+        worth = world.points.state[rows] * VIEWS_COUNTED + views
+        order = np.argsort(self._turn[cell] * 4 * VIEWS_COUNTED - worth, kind="stable")
+        return rows[order], cell[order]
 
 
 @compiled
