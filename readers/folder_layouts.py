@@ -28,7 +28,7 @@ from readers.frame_times import (
     ranks_of,
     shortened,
 )
-from readers.streams import Camera, Damage, FloatArray, ReadOptions, RecordingError, array
+from readers.streams import Camera, Damage, FloatArray, ReadOptions, RecordingError, array, unknown_transform
 
 BODY_FROM_CAMERA = array([0, 0, 1], [-1, 0, 0], [0, -1, 0])
 """Turns z forward, x right, y down into x forward, y left, z up."""
@@ -313,9 +313,22 @@ def _kitti_cameras(draft: Draft, path: Path, folders: dict[str, list[Path]]) -> 
     for name, files in folders.items():
         if (projection := projections.get(name[-1])) is not None:
             width, height = _size_of(files)
-            draft.cameras[name] = _rectified(projection, width, height)
+            draft.cameras[name] = replace(_rectified(projection, width, height), body_t_camera=_ahead(projection))
         else:
             draft.note(f"{name}: calib.txt has no P{name[-1]}, no intrinsics")
+
+
+def _ahead(projection: FloatArray) -> FloatArray:
+    """The transform of a rectified camera to the body: the place of camera 0, with the axes that the poses get.
+
+    P = K [I | t], so that the camera stands at -K⁻¹ P e₄; unknown where K cannot be inverted.
+    """
+    if not np.isfinite(projection).all() or np.linalg.matrix_rank(projection[:, :3]) < 3:
+        return unknown_transform()
+    mounted = np.eye(4)
+    mounted[:3, :3] = BODY_FROM_CAMERA
+    mounted[:3, 3] = -BODY_FROM_CAMERA @ np.linalg.solve(projection[:, :3], projection[:, 3])
+    return mounted
 
 
 def _rectified(projection: FloatArray, width: int, height: int) -> Camera:

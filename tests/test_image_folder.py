@@ -352,9 +352,19 @@ def test_kitti_folder(tmp_path: Path, labels: bool) -> None:
     camera = recording.cameras["image_1"]
     np.testing.assert_array_equal(camera.matrix, [[718, 0, 607], [0, 718, 185], [0, 0, 1]])
     assert camera.projection[0, 3] == -386
+    for name, right_m in (("image_0", 0.0), ("image_1", 386 / 718)):
+        mounted = recording.cameras[name].body_t_camera
+        np.testing.assert_array_equal(mounted[:3, :3], [[0, 0, 1], [-1, 0, 0], [0, -1, 0]])  # it looks ahead
+        np.testing.assert_allclose(mounted[:3, 3], [0, -right_m, 0], atol=1e-12)
     assert (camera.width_px, camera.height_px, camera.distortion_model) == (8, 6, "none")
     assert said(recording, "calib.txt has no labels") == (not labels)
     assert said(recording, "poses.txt has 2 poses for 3 images")
+
+
+def test_a_kitti_projection_that_cannot_be_inverted_tells_no_mounting(tmp_path: Path) -> None:
+    root = kitti(tmp_path, labels=True, poses="")
+    write(root / "calib.txt", "P0: 718 0 607 0 0 0 0 0 0 0 1 0")
+    assert np.isnan(open_folder(root).cameras["image_0"].body_t_camera).all()
 
 
 def test_kitti_with_too_many_poses_bad_rows_and_too_few_times(tmp_path: Path) -> None:

@@ -1,12 +1,16 @@
 """The log of the visual odometries: bit for bit, what is drawn is where it belongs, and the same data every time."""
 
+import dataclasses
 import itertools
+import math
 from pathlib import Path
 from typing import Any
 
 import fake_semidirect as fake
 import numpy as np
 import pytest
+import rerun.blueprint as rrb
+from rerun.chunk import RrdReader
 from scipy.spatial.transform import Rotation
 from test_rrd import assert_same, rows_of
 
@@ -15,6 +19,7 @@ from pipelines.semidirect.baseline_step import BaselineStep
 from pipelines.semidirect.step import Feature, SemidirectStep
 from workbench import rrd, rrd_reading
 from workbench import visual_traces as visual
+from workbench.blueprints import Bounds, visual_blueprint
 from workbench.schema import BASELINE, SCHEMAS, SEMIDIRECT, Archetype, quantities
 
 
@@ -215,3 +220,112 @@ def test_a_filter_that_diverged_shows_its_course_up_to_there() -> None:
     assert course.number == 3
     assert course.frame.tolist() == list(range(5, visual.HISTORY_FRAMES + 5))
     np.testing.assert_allclose(course.values[:, 0], 3 + course.frame / 100)
+
+
+# ---------------------------------------------------------------------------------- the saved view
+
+
+def shown(bounds: Bounds, step_type: type = SemidirectStep) -> dict[str, list[str]]:
+    """The titles of the plots of each tab."""
+    root = visual_blueprint(step_type, "r", "semidirect", bounds).root_container
+    tabs = [tab for tab in walked(root) if isinstance(tab, rrb.Tabs)][2]
+    return {str(tab.name): [str(view.name) for view in getattr(tab, "contents", ()) if hasattr(view, "name")]
+            for tab in tabs.contents}  # fmt: skip
+
+
+def walked(container: Any) -> list[Any]:
+    inner = container.contents if isinstance(container, rrb.Container) else []
+    return [container, *itertools.chain.from_iterable(walked(one) for one in inner)]
+
+
+def logged_until_the_end(path: Path, steps: list[SemidirectStep], monkeypatch: pytest.MonkeyPatch) -> Bounds:
+    """What the last view of a run of these steps is made from."""
+    seen: list[Bounds] = []
+    made = rrd.blueprint_of
+
+    def spy(step_type: Any, run: str, estimator: str, bounds: Bounds) -> Any:
+        seen.append(bounds)
+        return made(step_type, run, estimator, bounds)
+
+    monkeypatch.setattr(rrd, "blueprint_of", spy)
+    with rrd.RunWriter(
+        path, recording_id="m", run="fast", estimator="semidirect", step_type=SemidirectStep, settings_text=""
+    ) as writer:
+        for step in steps:
+            writer.step(step)
+        writer.finish({}, None)
+    assert seen[0].silent == frozenset()  # before anything is known all plots are there
+    return seen[-1]
+
+
+def test_a_plot_that_would_be_empty_is_left_out(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    nothing = {"height_m": math.nan, "map_height_m": math.nan, "stage_ms": np.full(5, math.nan), "bundle_keyframes": 0,
+               "bundle_points": 0, "bundle_outliers": 0}  # fmt: skip
+    steps = [dataclasses.replace(step, **nothing, prior_position_m=step.position_m + 0.01) for step in fake.steps(80)]
+    bounds = logged_until_the_end(tmp_path / "run.rrd", steps, monkeypatch)
+    assert {"scale/height", "work/stages", "bundle/size", "error"} <= bounds.silent
+    assert not {"tracked", "pose/position", "features/error", "alignment/level", "prior/correction"} & bounds.silent
+    everything, left = shown(Bounds()), shown(bounds)
+    assert set(everything) - set(left) == {"Height", "Errors"}
+    assert "Bundle" in everything["Keyframes"]
+    assert "Bundle" not in left["Keyframes"]
+    assert everything["Times"] == ["Time of the stages, ms"]
+    assert left["Times"] == []
+    assert (
+        "stage_times=true" in fixed(tmp_path / "run.rrd", "/runs/fast/semidirect/work/untimed", "TextDocument:text")[0]
+    )
+
+
+def fixed(path: Path, entity: str, component: str) -> Any:
+    """What was logged once for the whole run."""
+    chunk = next(iter(RrdReader(path).stream().filter(content=entity, components=component)))
+    return chunk.to_record_batch().column(component).to_pylist()[0]
+
+
+def test_a_run_without_a_map_shows_its_start_and_no_filters(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    bounds = logged_until_the_end(tmp_path / "run.rrd", list(fake.steps(4)), monkeypatch)
+    tabs = shown(bounds)
+    assert "features/error" in bounds.silent
+    assert "One filter" not in tabs
+    assert tabs["Start, lost"][:1] == ["Corners followed since the first view"]
+
+
+def test_the_axis_of_times_leaves_out_the_compilation() -> None:
+    stage_ms = np.full((500, 5), 2.0)
+    stage_ms[3] = 9000.0  # the first start compiles
+    assert visual.top_of_times(stage_ms) == pytest.approx(2.6)
+    assert visual.top_of_times(np.full((4, 5), math.nan)) == 0.0
+    assert visual.top_of_times(np.empty((0, 5))) == 0.0
+
+
+def test_the_levels_of_the_alignment_have_colours_of_their_own(tmp_path: Path) -> None:
+    colours = visual.level_colours(3).tolist()
+    assert len(set(colours)) == 3
+    assert all(colour & 0xFF == 0xFF for colour in colours)
+    logged(tmp_path / "run.rrd", 40)
+    pairs = fixed(tmp_path / "run.rrd", "/runs/fast/semidirect/alignment/level", "SeriesLines:colors")
+    assert [colour | 0xFF for colour in pairs[::2]] == pairs[1::2]  # the same, paler before
+    assert len(set(pairs)) == len(pairs)
+
+
+def test_what_the_prior_was_off_is_drawn_where_there_is_a_pose(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    there = [step.position_m for step in fake.steps(70)]
+    steps = [
+        dataclasses.replace(step, prior_position_m=there[max(k - 2, 0)], aligned_position_m=there[max(k - 1, 0)])
+        for k, step in enumerate(fake.steps(70))
+    ]
+    logged_until_the_end(tmp_path / "run.rrd", steps, monkeypatch)
+    rows = drawn(tmp_path / "run.rrd", "/runs/fast/semidirect/prior/correction", "Scalars:scalars")
+    for step in steps:
+        ends = (step.aligned_position_m, step.position_m)
+        want = [np.linalg.norm(end - step.prior_position_m) if step.accepted else math.nan for end in ends]
+        np.testing.assert_allclose(rows[step.frame], want, rtol=1e-12)
+
+
+def test_the_numbers_tell_the_cost_of_every_iteration() -> None:
+    step = next(step for step in fake.steps(60) if np.isfinite(step.align_cost).sum() > 3)
+    columns = {field: np.array([getattr(step, field)]) if np.isscalar(getattr(step, field)) else [getattr(step, field)]
+               for field in quantities(SemidirectStep)}  # fmt: skip
+    text = visual.numbers({"frame": np.array([step.frame]), **columns}, semidirect=True)[0]
+    for costs in step.align_cost:
+        assert " → ".join(f"{cost:.4g}" for cost in costs[np.isfinite(costs)]) in text

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import colorsys
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import rerun as rr
@@ -84,6 +84,8 @@ class Bounds:
         landmarks: of the range filter: slot, name, and upper end of the plot of ranges in m (0: the viewer's choice).
         smoothed: slots, from 1, of which there are smoothed ranges.
         height_m: of the highest camera over the ground, for views in space.
+        silent: entities, relative to the run's root, whose numbers are all 0 or missing: their plots would be empty.
+        slowest_ms: upper end of the plot of times (0: the viewer's choice).
     """
 
     frames: tuple[int, int] | None = None
@@ -93,6 +95,8 @@ class Bounds:
     landmarks: tuple[tuple[int, str, float], ...] = ()
     smoothed: frozenset[int] = frozenset()
     height_m: float = 0.0
+    silent: frozenset[str] = frozenset()
+    slowest_ms: float = 0.0
 
 
 def sensor_blueprint(bounds: Bounds) -> rrb.Blueprint:
@@ -326,9 +330,9 @@ def visual_blueprint(step_type: type[Step], run: str, estimator: str, bounds: Bo
     lanes = [f"{root}/verdict", f"{root}/stage", f"{root}/verdicts/**"]
     return rrb.Blueprint(
         rrb.Vertical(
-            rrb.Horizontal(rrb.Tabs(*images), _visual_maps(run, bounds), column_shares=[5, 6]),
+            rrb.Horizontal(rrb.Tabs(*images), _visual_maps(run, bounds, semidirect=semidirect), column_shares=[5, 6]),
             rrb.Horizontal(
-                _visual_plots(root, bounds.frames, semidirect=semidirect),
+                _visual_plots(root, bounds, semidirect=semidirect),
                 _texts(run, root, _lags(bounds.frames)),
                 column_shares=[3, 2],
             ),
@@ -340,12 +344,9 @@ def visual_blueprint(step_type: type[Step], run: str, estimator: str, bounds: Bo
     )
 
 
-def _visual_maps(run: str, bounds: Bounds) -> rrb.Tabs:
+def _visual_maps(run: str, bounds: Bounds, *, semidirect: bool) -> rrb.Tabs:
     """The map in space, with the reference laid over the path, and from above, with the reference as it is."""
     world = f"/world/runs/{run}"
-    hidden: dict[Any, Any] = {
-        f"{world}/map/{name}": rrb.EntityBehavior(visible=False) for name in ("sigma", "covariance")
-    }
     eye = None
     if bounds.extent is not None:
         reach = bounds.extent.size_m + 2 * bounds.height_m
@@ -354,111 +355,151 @@ def _visual_maps(run: str, bounds: Bounds) -> rrb.Tabs:
             look_target=(bounds.extent.x_m, bounds.extent.y_m, bounds.height_m / 2),
             eye_up=(0.0, 0.0, 1.0),
         )
-    space = rrb.Spatial3DView(
-        origin="/world",
-        contents=[f"{world}/**", f"- {world}/above/**", "/world/scale"],
-        name="Space: points by σ, keyframes orange, reference green",
-        eye_controls=eye,
-        overrides=hidden,
-        background=[18, 20, 24],
-    )
+
+    def space(name: str, hidden: Sequence[str]) -> rrb.Spatial3DView:
+        unseen: dict[Any, Any] = {f"{world}/map/{one}": rrb.EntityBehavior(visible=False) for one in hidden}
+        return rrb.Spatial3DView(
+            origin="/world",
+            contents=[f"{world}/**", f"- {world}/above/**", "/world/scale"],
+            name=name,
+            eye_controls=eye,
+            overrides=unseen,
+            background=[18, 20, 24],
+        )
+
     above = _map(
         run, bounds.extent, "Map: path blue, reference green", ("above/path",),
         ["/world/reference/**", "/world/scale", *(f"{world}/{one}" for one in _FROM_ABOVE)],
     )  # fmt: skip
-    return rrb.Tabs(space, above)
+    points = space("Space: points by σ, keyframes orange, reference green", ("sigma", "covariance"))
+    uncertain = (
+        space("Covariances of the points, 1σ", ("sigma", "points"))
+        if semidirect
+        else space("σ of the points as balls", ("points",))
+    )
+    return rrb.Tabs(points, above, uncertain)
+
+
+class _Plot(NamedTuple):
+    """One plot: its title, its entity, and which of the entity's series it shows, all of them if empty."""
+
+    title: str
+    entity: str
+    show: tuple[bool, ...] = ()
 
 
 _FROM_ABOVE = ("above/**", "map/points")
-_VISUAL_PLOTS: Mapping[str, Sequence[tuple[str, str]]] = {
+_FILTERS = "One filter"
+_TIMES = "Times"
+_VISUAL_PLOTS: Mapping[str, Sequence[_Plot]] = {
     "Tracking": (
-        ("Points that agree with the pose", "tracked"),
-        ("Reprojection error, px: median, 90 %", "features/error"),
-        ("Frames since the relocalisation, number of the map", "map/number"),
+        _Plot("Points that agree", "tracked"),
+        _Plot("Reprojection error, px", "features/error"),
+        _Plot("Map; since found again", "map/number"),
     ),
     "Map": (
-        ("Keyframes and points", "map/size"),
-        ("Median depth of the scene", "map/scene_depth"),
-        ("Frame became a keyframe", "keyframe/made"),
+        _Plot("Points", "map/size", (False, True)),
+        _Plot("Keyframes", "map/size", (True, False)),
+        _Plot("Median depth of the scene", "map/scene_depth"),
     ),
-    "Scale": (("Metres a unit of the first map", "scale/metres_per_unit"),),
-    "Pose": (("Camera in the world", "pose/position"), ("Standard deviations", "pose/sigma")),
+    "Scale": (_Plot("Metres a unit of the first map", "scale/metres_per_unit"),),
+    "Pose": (_Plot("Camera in the world", "pose/position"), _Plot("Standard deviations", "pose/sigma")),
 }
-_BASELINE_PLOTS: Mapping[str, Sequence[tuple[str, str]]] = {
+_BEGINNINGS = (
+    _Plot("Corners followed since the first view", "start/matches"),
+    _Plot("Their way, and what no turn explains", "start/motion"),
+    _Plot("Lost: likeness of the keyframe tried", "relocalisation/correlation"),
+)
+_BASELINE_PLOTS: Mapping[str, Sequence[_Plot]] = {
     "Search": (
-        ("Corners of the frame", "tracking/corners"),
-        ("Coarse step: points tried and found", "tracking/coarse"),
+        _Plot("Corners of the frame", "tracking/corners"),
+        _Plot("Coarse step: points tried and found", "tracking/coarse"),
     ),
     "Keyframes": (
-        ("Distance to the nearest keyframe / depth", "keyframe/distance"),
-        ("Points added and removed", "structure/changed"),
-        ("Bundle: cost, px²", "bundle/cost"),
+        _Plot("Distance to the nearest / depth", "keyframe/distance"),
+        _Plot("Points added and removed", "structure/changed"),
+        _Plot("Bundle: cost, px²", "bundle/cost"),
     ),
-    "Times": (("Time of the stages, ms", "work/stages"),),
+    "Start, lost": _BEGINNINGS,
+    _TIMES: (_Plot("Time of the stages, ms", "work/stages"),),
 }
-_SEMIDIRECT_PLOTS: Mapping[str, Sequence[tuple[str, str]]] = {
+_SEMIDIRECT_PLOTS: Mapping[str, Sequence[_Plot]] = {
+    "Prior": (
+        _Plot("How far the prior was off, m", "prior/correction"),
+        _Plot("Standard deviations of the alignment", "alignment/sigma"),
+    ),
     "Alignment": (
-        ("Alignment cost, grey²", "alignment/level"),
-        ("Iterations by level", "alignment/iterations"),
-        ("Patches and inliers", "alignment/patch_count"),
+        _Plot("Cost, grey²", "alignment/level"),
+        _Plot("Iterations by level", "alignment/iterations"),
+        _Plot("Patches and inliers", "alignment/patch_count"),
     ),
     "Refinement": (
-        ("Error before, after, and its scale, px", "refinement/error"),
-        ("Points by what became of them", "features/count"),
+        _Plot("Error and its scale, px", "refinement/error"),
+        _Plot("Points found", "features/count", (True, *[False] * 8)),
+        _Plot("Points not found, by cause", "features/count", (False, *[True] * 8)),
     ),
     "Keyframes": (
-        ("Distance to the nearest keyframe / depth", "keyframe/distance"),
-        ("Points added and removed", "structure/changed"),
-        ("Bundle", "bundle/size"),
+        _Plot("Distance to the nearest / depth", "keyframe/distance"),
+        _Plot("Points added and removed", "structure/changed"),
+        _Plot("Bundle", "bundle/size"),
     ),
+    _FILTERS: (),
     "Filters": (
-        ("Filters by outcome", "filters/count"),
-        ("Filters at work", "filters/number"),
-        ("Median σ/z_range and a/(a+b)", "filters/spread"),
+        _Plot("By outcome", "filters/count"),
+        _Plot("At work", "filters/number"),
+        _Plot("Median σ/z_range", "filters/spread", (True, False)),
+        _Plot("Median a/(a+b)", "filters/spread", (False, True)),
     ),
-    "Image": (("Mean grey level", "image/grey"), ("Sharpness", "image/sharpness")),
-    "Height": (("Height: sensor, and over the map, m", "scale/height"),),
-    "Times": (("Time of the stages, ms", "work/stages"),),
+    "Image": (_Plot("Mean grey level", "image/grey"), _Plot("Sharpness", "image/sharpness")),
+    "Height": (_Plot("Height: sensor, and over the map, m", "scale/height"),),
+    "Start, lost": _BEGINNINGS,
+    _TIMES: (_Plot("Time of the stages, ms", "work/stages"),),
 }
+_ERRORS = (
+    _Plot("Position error, m (x blue, y orange, distance white)", "error", (True, True, True, False)),
+    _Plot("Heading error, rad", "error", (False, False, False, True)),
+)
 
 
-def _visual_plots(root: str, frames: tuple[int, int] | None, *, semidirect: bool) -> rrb.Tabs:
-    def plot(
-        name: str, entities: Sequence[str], *, show: Sequence[bool] = (), legend: bool = True
-    ) -> rrb.TimeSeriesView:
-        lines = rr.SeriesLines.from_fields(visible_series=list(show))
+def _visual_plots(root: str, bounds: Bounds, *, semidirect: bool) -> rrb.Tabs:
+    """A tab for each stage; what has nothing to show is left out, and the times say how they are asked for."""
+
+    def view(plot: _Plot, *, legend: bool = True, top: float = 0.0) -> rrb.TimeSeriesView:
+        entity = f"{root}/{plot.entity}"
+        lines = rr.SeriesLines.from_fields(visible_series=list(plot.show))
         return rrb.TimeSeriesView(
             origin=root,
-            contents=[f"{root}/{entity}" for entity in entities],
-            name=name,
-            axis_x=_axis(frames),
-            overrides={f"{root}/{entity}": lines for entity in entities} if show else {},
-            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend),
+            contents=[entity],
+            name=plot.title,
+            axis_x=_axis(bounds.frames),
+            axis_y=rrb.ScalarAxis(range=(0.0, top), zoom_lock=False) if top > 0 else None,
+            overrides={entity: lines} if plot.show else {},
+            plot_legend=rrb.PlotLegend(corner=rrb.Corner2D.LeftTop, visible=legend and sum(plot.show) != 1),
         )
 
-    groups = {**_VISUAL_PLOTS, **(_SEMIDIRECT_PLOTS if semidirect else _BASELINE_PLOTS)}
-    tabs: list[Any] = [
-        rrb.Horizontal(*(plot(name, [entity]) for name, entity in plots), name=tab) for tab, plots in groups.items()
-    ]
-    if semidirect:
-        slots = range(1, FOLLOWED_SHOWN + 1)
-        tabs.insert(
-            7,
-            rrb.Grid(
-                *(plot(f"Filter of slot {k}: μ ± σ, 1/m", [f"filters/shown/{k}/depth"], legend=False) for k in slots),
-                *(plot(f"Slot {k}: a/(a+b), C1", [f"filters/shown/{k}/ratio"], legend=False) for k in slots),
-                grid_columns=FOLLOWED_SHOWN,
-                name="One filter",
-            ),
-        )
-    tabs.append(
-        rrb.Horizontal(
-            plot("Position error, m (x blue, y orange, distance white)", ["error"], show=[True, True, True, False]),
-            plot("Heading error, rad", ["error"], show=[False, False, False, True]),
-            name="Errors",
-        )
-    )
+    tabs: list[Any] = []
+    groups = {**_VISUAL_PLOTS, **(_SEMIDIRECT_PLOTS if semidirect else _BASELINE_PLOTS), "Errors": _ERRORS}
+    for tab, plots in groups.items():
+        loud = [plot for plot in plots if plot.entity not in bounds.silent]
+        top = bounds.slowest_ms if tab == _TIMES else 0.0
+        if tab == _FILTERS and "filters/number" not in bounds.silent:
+            tabs.append(_one_filter(view))
+        elif loud:
+            tabs.append(rrb.Horizontal(*(view(plot, top=top) for plot in loud), name=tab))
+        elif tab == _TIMES:
+            tabs.append(rrb.TextDocumentView(origin=f"{root}/work/untimed", name=tab))
     return rrb.Tabs(*tabs)
+
+
+def _one_filter(view: Callable[..., rrb.TimeSeriesView]) -> rrb.Grid:
+    """The courses of some depth filters side by side."""
+    shown = [f"filters/shown/{k}" for k in range(1, FOLLOWED_SHOWN + 1)]
+    return rrb.Grid(
+        *(view(_Plot(f"Slot {k}: μ ± σ, 1/m", f"{slot}/depth"), legend=False) for k, slot in enumerate(shown, 1)),
+        *(view(_Plot(f"Slot {k}: a/(a+b), C1", f"{slot}/ratio"), legend=False) for k, slot in enumerate(shown, 1)),
+        grid_columns=FOLLOWED_SHOWN,
+        name=_FILTERS,
+    )
 
 
 def _panels() -> Sequence[Any]:

@@ -305,6 +305,7 @@ class RunWriter(_Writer):
         self._changes = traces.Changes()
         self._lanes: dict[Verdict, bool] = {}
         self._span: tuple[int, int] | None = None
+        self._told: set[str] = set()
         drawing = _DRAWINGS.get(step_type, Drawing)
         self._drawing = drawing(self._file, self._schema, run, estimator, scene)
         self._file.static(f"/runs/{run}/settings", rr.TextDocument(settings_text, media_type="text/plain"))
@@ -333,6 +334,7 @@ class RunWriter(_Writer):
         colours = np.array([0x42A5F5FF, 0xFFB74DFF, 0xFFFFFFFF, 0x42A5F5FF], np.uint32)
         self._file.static(f"{self._root}/error", rr.SeriesLines(names=names, colors=colours))
         columns = rr.Scalars.columns(scalars=np.asarray(values, np.float64))
+        self._told |= {"error"} if np.isfinite(values).any() else set()
         self._file.send(f"{self._root}/error", np.asarray(frames, np.int64), np.asarray(t_ns, np.int64), columns)
 
     def smoothed(self, slot: int, frames: Ints, t_ns: Ints, mean: Floats, covariance: Floats) -> None:
@@ -354,7 +356,8 @@ class RunWriter(_Writer):
         rows = "\n\n".join(f"**{key}** – {_number(value)}" for key, value in summary.items())
         self._file.static(f"/runs/{self._run}/summary", document(rows))
         known = self._drawing.finish(aligned_path, self._bounds.extent)
-        self._view(**({} if self._span is None else {"frames": self._span}), **known)
+        silent = frozenset({*self._schema.of(Archetype.SCALARS), "error"} - self._told) | self._drawing.silent
+        self._view(**({} if self._span is None else {"frames": self._span}), silent=silent, **known)
 
     # ---- what is logged once
 
@@ -397,6 +400,8 @@ class RunWriter(_Writer):
     def _values(self, table: traces.Columns) -> None:
         for entity, values in traces.scalar_groups(self._schema, table):
             counts = np.full(len(values), values.shape[1])
+            if entity not in self._told and np.nan_to_num(values).any():
+                self._told.add(entity)
             self._send(entity, table, rr.Scalars.columns(scalars=values.ravel()).partition(counts))
         for entity, rows in self._schema.of(Archetype.INTEGERS).items():
             integers = {row.field: table[row.field] for row in rows}

@@ -28,6 +28,8 @@ class Drawing:
         self.world = f"/world/runs/{run}"
         self.image = f"{IMAGE}/{run}"
         self.scene = scene
+        self.silent: frozenset[str] = frozenset()
+        """Entities, relative to the root, of plots that had no number but 0 so far."""
 
     def constants(self) -> None:
         """Log what holds for the whole run."""

@@ -14,7 +14,7 @@ from workbench import traces
 from workbench import visual_traces as visual
 from workbench.blueprints import Extent
 from workbench.rrd_drawing import Drawing
-from workbench.rrd_file import ARROW_SHARE, COLOURS, Floats, Ints, RrdFile, arrow, flat, marker, repeated
+from workbench.rrd_file import ARROW_SHARE, COLOURS, Floats, Ints, RrdFile, arrow, document, flat, marker, repeated
 from workbench.schema import Schema
 from workbench.traces import Joined
 
@@ -27,6 +27,10 @@ STAGE_COLOURS: Mapping[Stage, int] = {
     Stage.LOST: 0xF44336FF,
     Stage.SKIPPED: 0x9E9E9EFF,
 }
+UNTIMED = (
+    "The stages were not timed, since a clock's numbers would differ from replay to replay. Replay with "
+    "`--set stage_times=true` to have them here."
+)
 CAMERA_DEPTH = 0.3
 """Depth of the camera's frustum, in scene depths."""
 
@@ -38,8 +42,10 @@ class VisualDrawing(Drawing):
         super().__init__(file, schema, run, estimator, scene)
         self._path: list[tuple[Ints, Ints, Floats, Floats, Any]] = []
         self._depths: list[Floats] = []
+        self._stages_ms: list[Floats] = []
         self._stage = -1
         self._size = np.array([np.nan, np.nan])
+        self.silent = frozenset({"features/error"})
 
     # ---- what is logged once
 
@@ -60,6 +66,7 @@ class VisualDrawing(Drawing):
         names = list(visual.STAGE_NAMES)
         colours = [STAGE_COLOURS[stage] for stage in Stage]
         self.file.static(f"{self.root}/stage", rr.StateConfiguration(values=names, labels=names, colors=colours))
+        self.file.static(f"{self.root}/work/untimed", document(UNTIMED))
         self.file.static(f"{self.root}/features/error", rr.SeriesLines(names=["median [px]", "90 % [px]"]))
 
     def legends(self, table: traces.Columns) -> Mapping[str, Any]:  # noqa: D102
@@ -92,12 +99,19 @@ class VisualDrawing(Drawing):
         self._structure(table)
         self._way(table)
         self._stages(table)
+        self._stages_ms.append(table["stage_ms"])
         errors = Joined.of(table["error_px"]).chosen(visual.found(np.concatenate(table["outcome"])))
         spread = np.column_stack([visual.quantiles(errors, 0.5), visual.quantiles(errors, 0.9)])
-        self.send("features/error", table, rr.Scalars.columns(scalars=spread))
+        self._series("features/error", table, spread)
         texts = self._texts(table)
         media = repeated(rr.TextDocument.columns(media_type=["text/markdown"]), len(texts))
         self.send("numbers", table, rr.TextDocument.columns(text=texts), media)
+
+    def _series(self, entity: str, table: traces.Columns, values: Floats) -> None:
+        """Log rows of numbers [n, k] for a plot, and whether there ever was one."""
+        told = bool(np.nan_to_num(values).any())
+        self.silent = self.silent - {entity} if told else self.silent
+        self.send(entity, table, _scalars(values))
 
     def _texts(self, table: traces.Columns) -> list[str]:
         return visual.numbers(table, semidirect=False)
@@ -198,9 +212,10 @@ class VisualDrawing(Drawing):
         """Draw the whole path, and the reference [n, 3] that was laid over it, if any."""
         if aligned_path is not None and len(aligned_path):
             self._line("reference", [aligned_path], 1.2)
+        known = {"slowest_ms": visual.top_of_times(np.concatenate(self._stages_ms))}
         frames, t_ns, position, pose, maps = (np.concatenate(column) for column in zip(*self._path, strict=True))
         if not len(frames):
-            return {}
+            return known
         cuts = np.flatnonzero((np.diff(maps) != 0) | (np.diff(frames) > self._gap(frames))) + 1
         self._line("corrected", np.split(position, cuts), 0.6)
         extent = Extent.of(np.concatenate([position[:, :2], *([] if given is None else [given.corners])]))
@@ -212,7 +227,7 @@ class VisualDrawing(Drawing):
         depth = float(np.median(depths)) if len(depths) else 1.0
         self._camera(CAMERA_DEPTH * depth)
         self._ground(extent)
-        return {"extent": extent, "height_m": float(position[:, 2].max())}
+        return {**known, "extent": extent, "height_m": float(position[:, 2].max())}
 
     def _gap(self, frames: Ints) -> float:
         """More frames than this without a pose part the line of the path."""
@@ -242,6 +257,7 @@ class SemidirectDrawing(VisualDrawing):
     def __init__(self, file: RrdFile, schema: Schema, run: str, estimator: str, scene: Any = None) -> None:
         super().__init__(file, schema, run, estimator, scene)
         self._filters = visual.FilterLog()
+        self.silent |= {"alignment/level", "alignment/iterations", "prior/correction", "filters/spread"}
 
     def constants(self) -> None:  # noqa: D102
         super().constants()
@@ -251,6 +267,8 @@ class SemidirectDrawing(VisualDrawing):
         self.file.static(f"{self.image}/filters", rr.Points2D.from_fields(radii=point(2), draw_order=10))
         spread = ["median σ / z_range", "median a/(a+b)"]
         self.file.static(f"{self.root}/filters/spread", rr.SeriesLines(names=spread))
+        corrections = ["by the alignment [m]", "in the end [m]"]
+        self.file.static(f"{self.root}/prior/correction", rr.SeriesLines(names=corrections))
         for k in range(visual.FOLLOWED):
             self._filter_legends(f"{self.root}/filters/shown/{k + 1}")
 
@@ -264,9 +282,12 @@ class SemidirectDrawing(VisualDrawing):
         coarsest = self.scene.coarsest_level if self.scene is not None else 0
         levels = [abs(coarsest - k) for k in range(len(table["align_iterations"][0]))]
         names = [f"level {level} {when}" for level in levels for when in ("before", "after")]
-        self.file.static(f"{self.root}/alignment/level", rr.SeriesLines(names=names))
+        colours = visual.level_colours(len(levels))
+        pairs = np.repeat(colours, 2)
+        pairs[::2] = pairs[::2] & ~np.uint32(0xFF) | np.uint32(0x80)  # before: paler
+        self.file.static(f"{self.root}/alignment/level", rr.SeriesLines(names=names, colors=pairs))
         iterations = [f"level {level}" for level in levels]
-        self.file.static(f"{self.root}/alignment/iterations", rr.SeriesLines(names=iterations))
+        self.file.static(f"{self.root}/alignment/iterations", rr.SeriesLines(names=iterations, colors=colours))
         return super().legends(table)
 
     def _texts(self, table: traces.Columns) -> list[str]:
@@ -283,8 +304,12 @@ class SemidirectDrawing(VisualDrawing):
         good = traces.finite(patches.values, 1)
         self._points("patches", table, patches, good, colors=visual.heat(residual[good] / visual.BAD_RESIDUAL))
         costs = visual.level_costs(table)
-        self.send("alignment/level", table, _scalars(costs))
-        self.send("alignment/iterations", table, _scalars(np.stack(list(table["align_iterations"])).astype(float)))
+        self._series("alignment/level", table, costs)
+        ways = [table[name] - table["prior_position_m"] for name in ("aligned_position_m", "position_m")]
+        corrections = np.linalg.norm(np.stack(ways, axis=1), axis=2)
+        corrections[~table["accepted"].astype(bool)] = np.nan  # the last pose is held there
+        self._series("prior/correction", table, corrections)
+        self._series("alignment/iterations", table, np.stack(list(table["align_iterations"])).astype(float))
 
     def _epipolar(self, table: traces.Columns) -> None:
         ends, outcome = Joined.of(table["epipolar_px"]), np.concatenate(table["filter_outcome"])
@@ -302,7 +327,7 @@ class SemidirectDrawing(VisualDrawing):
             visual.quantiles(Joined(ends.counts, values), 0.5)
             for values in (sigma / scale, np.concatenate(table["filter_ratio"]))
         ]
-        self.send("filters/spread", table, _scalars(np.column_stack(medians)))
+        self._series("filters/spread", table, np.column_stack(medians))
 
     def _courses(self, table: traces.Columns) -> None:
         shown, diverged = self._filters.take(table)

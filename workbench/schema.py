@@ -560,6 +560,8 @@ end, then the next one that starts.
 | `/runs/RUN/ESTIMATOR/stage` | lane: starting, tracked, lost, … |
 | `/runs/RUN/ESTIMATOR/features/error` | median and 90 % quantile of the reprojection error (px of the level) |
 | `/runs/RUN/ESTIMATOR/alignment/level`, `/iterations` | cost before and after (grey²), and iterations, of each level |
+| `/runs/RUN/ESTIMATOR/prior/correction` | way from the prior to the aligned position, and to the final one (m) |
+| `/runs/RUN/ESTIMATOR/work/untimed` | how the stages' times are asked for; shown where they were not |
 | `/runs/RUN/ESTIMATOR/filters/spread` | medians over the filters of σ/z_range and of a/(a+b) |
 | `/runs/RUN/ESTIMATOR/filters/shown/K/depth` | μ, μ ± σ (1/m) of the filter that slot K follows, 1 to 8 |
 | `/runs/RUN/ESTIMATOR/filters/shown/K/ratio`, `/number` | its a/(a+b) and C1; its number |
@@ -573,8 +575,8 @@ end, then the next one that starts.
 | `/world/runs/RUN/path/reference` | the reference laid over it by Sim(3) |
 | `/world/runs/RUN/above/path`, `/body`, `/heading` | the path seen from above |
 | `/world/runs/RUN/map/points` | the map's points, green where σ is 0.1 % of the scene's depth, red at 10 % |
-| `/world/runs/RUN/map/sigma` | the same as balls of radius σ, hidden until switched on |
-| `/world/runs/RUN/map/covariance` | the same as ellipsoids of one standard deviation (semidirect), hidden likewise |
+| `/world/runs/RUN/map/sigma` | the same as balls of radius σ, in a tab of its own for the baseline |
+| `/world/runs/RUN/map/covariance` | the same as ellipsoids of one standard deviation (semidirect) |
 | `/world/runs/RUN/map/keyframes`, `/plane` | frusta of the keyframes; z = 0, the first map's plane, as a grid |
 """
 

@@ -6,6 +6,7 @@ the viewer, which puts the corner of the first pixel at (0, 0): half a pixel mor
 
 from __future__ import annotations
 
+import colorsys
 import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -133,6 +134,23 @@ def level_costs(table: Columns) -> Floats:
     return np.array(rows)
 
 
+def level_colours(levels: int) -> Colours:
+    """RGBA of each level of the alignment, from the coarsest, red, to the finest, blue."""
+    hues = np.linspace(0.02, 0.58, levels)
+    rgb = np.array([colorsys.hsv_to_rgb(hue, 0.65, 1.0) for hue in hues])
+    red, green, blue = np.round(rgb * 255).astype(np.uint32).T
+    return np.asarray(red << 24 | green << 16 | blue << 8 | np.uint32(0xFF), np.uint32)
+
+
+def top_of_times(stage_ms: Floats) -> float:
+    """Upper end of a plot of the stages' times [n, k] in ms, a little above all but the slowest hundredth; 0 without.
+
+    The first frames of a first start compile for seconds: on the axis of all frames nothing else would be seen.
+    """
+    slowest = np.nan_to_num(stage_ms).max(axis=1)
+    return 1.3 * float(np.quantile(slowest, 0.99, method="lower")) if len(slowest) else 0.0
+
+
 # ------------------------------------------------------------------------------- filters
 
 
@@ -238,13 +256,13 @@ def _numbers(table: Columns, row: int, semidirect: bool) -> str:
 
 def _semidirect_numbers(table: Columns, row: int) -> list[str]:
     levels = len(table["align_iterations"][row])
-    costs = level_costs({"align_cost": table["align_cost"][row : row + 1]})[0].reshape(levels, 2)
+    courses = [" → ".join(f"{cost:.4g}" for cost in costs[np.isfinite(costs)]) for costs in table["align_cost"][row]]
     head, line = _LEVELS
     stops = [STOP_NAMES[int(stop)] for stop in table["align_stop"][row]]
-    aligned = zip(range(1, levels + 1), table["align_iterations"][row].tolist(), costs.tolist(), stops, strict=True)
+    aligned = zip(range(1, levels + 1), table["align_iterations"][row].tolist(), courses, stops, strict=True)
     heights = f"{table['height_m'][row]:.4g} m by the sensor, {table['map_height_m'][row]:.4g} m over the map"
     return [
-        head + "".join(line % (k, n, before, after, stop) for k, n, (before, after), stop in aligned),
+        head + "".join(line % level for level in aligned),
         f"Pose: {_course(table['pose_cost'][row])} px² in {int(table['pose_iterations'][row])} iterations; error "
         f"{table['error_before_px'][row]:.3g} → {table['error_after_px'][row]:.3g} px",
         f"Bundle: {_course(table['bundle_cost'][row])} px², {int(table['bundle_keyframes'][row])} keyframes, "
@@ -261,7 +279,7 @@ def _course(costs: Floats) -> str:
 _COUNTS = table_form(
     "Points looked for", " ".join(f.name.lower().replace("_", "·") for f in Feature), "%d " * len(Feature)
 )
-_LEVELS = table_form("Alignment, coarse to fine, grey²", "# iterations before after ended", "%d %d %.2f %.2f %s")
+_LEVELS = table_form("Alignment, coarse to fine, grey²", "# iterations cost·by·iteration ended", "%d %d %s %s")
 
 
 def stage_changes(before: int, stages: Sequence[int]) -> list[tuple[int, str]]:

@@ -13,6 +13,7 @@ from dataclasses import dataclass
 from typing import Any, NamedTuple
 
 import numpy as np
+import pandas as pd
 
 from pipelines.evaluation import path_lengths
 from pipelines.semidirect.step import Feature, Stage
@@ -22,7 +23,13 @@ from workbench.diagnosis.finding import Bools, Case, Evidence, Finding, Floats, 
 ESTIMATORS = ("semidirect", "ptam")
 USED = Verdict.UNDECODABLE | Verdict.SIZE_CHANGED | Verdict.OUT_OF_ORDER | Verdict.DUPLICATE_FRAME
 SCALE_PARTS = 8
-"""Parts of the path whose lengths are held against the reference's."""
+"""Parts of the path whose lengths are held against the reference's, at most."""
+CHORDS = 80
+"""Straight pieces that the path is measured by, about."""
+BEFORE_A_LOSS = 10
+"""Frames before a loss that tell whether the ground had corners."""
+USUAL_FRAMES = 61
+"""What is usual at a frame is the median over so many about it."""
 
 
 @dataclass(frozen=True)
@@ -114,6 +121,23 @@ def _dt_evidence(signals: Signals, row: int, bounds: Mapping[str, float]) -> tup
     return (Evidence(name="dt_s", value=_dt(signals, row), unit="s", usual=usual, bound=bound),)
 
 
+def _of_corners(signals: Signals) -> str:
+    """The field that tells how many corners there are to make points of."""
+    return "filters" if signals.case.estimator == "semidirect" else "corners"
+
+
+def _corners(signals: Signals, row: int) -> float:
+    """Their median over the frames with a pose before a row."""
+    before = np.flatnonzero(signals.accepted[:row])[-BEFORE_A_LOSS:]
+    found = np.asarray(signals.case[_of_corners(signals)], np.float64)[before]
+    return float(np.median(found)) if len(found) else math.nan
+
+
+def _usual_corners(signals: Signals) -> float:
+    found = np.asarray(signals.case[_of_corners(signals)], np.float64)[signals.accepted]
+    return float(np.median(found)) if len(found) else math.nan
+
+
 def _share(feature: Feature, *more: Feature) -> Callable[[Signals, int, Mapping[str, float]], bool]:
     """Whether points that failed so are the largest part of those looked for."""
 
@@ -170,11 +194,21 @@ CAUSES: tuple[Cause, ...] = (
         name="lost-flat",
         cause="the ground below has too little texture for points to be told apart",
         remedy="fly higher, or lower corner_threshold and corner_min_score",
-        thresholds={"share": 0.3},
+        thresholds={"share": 0.3, "corners": 0.35},
         is_it=lambda signals, row, bounds: (
-            signals.rings(Verdict.LOW_TEXTURE, row) or _share(Feature.FLAT)(signals, row, bounds)
+            signals.rings(Verdict.LOW_TEXTURE, row)
+            or _share(Feature.FLAT)(signals, row, bounds)
+            or _corners(signals, row) < bounds["corners"] * _usual_corners(signals)
         ),
-        evidence=_share_evidence(Feature.FLAT),
+        evidence=lambda signals, row, bounds: (
+            *_share_evidence(Feature.FLAT)(signals, row, bounds),
+            Evidence(
+                name=_of_corners(signals),
+                value=_corners(signals, row),
+                usual=_usual_corners(signals),
+                bound=bounds["corners"] * _usual_corners(signals),
+            ),
+        ),
     ),
     Cause(
         name="lost-alignment",
@@ -354,47 +388,172 @@ def _height_drift(case: Case, rule: Rule) -> Iterable[Finding]:
     )  # fmt: skip
 
 
-def _reference_scale(case: Case, rule: Rule) -> Iterable[Finding]:
-    """Lengths of parts of the path against the reference's, relative to the first part."""
+class Chords(NamedTuple):
+    """The path in short straight pieces [m]: first and last row of each, its length, and the reference's."""
+
+    first: Ints
+    last: Ints
+    length: Floats
+    truth_m: Floats
+
+
+def _chords(case: Case) -> Chords:
+    """Pieces within one map, of frames with a pose and a reference, whose times are not in doubt.
+
+    A piece is one of `CHORDS` of the path: so long that a frame's stamp does not matter in it.
+    """
     signals = case.once(Signals)
     known = signals.accepted & np.isfinite(case.reference[:, :2]).all(axis=1)
-    rows = np.flatnonzero(known)
-    if len(rows) < 10 * SCALE_PARTS:
+    ends = np.flatnonzero(known)[:: max(1, int(known.sum()) // CHORDS)]
+    first, last = ends[:-1], ends[1:]
+    doubtful = np.cumsum(~known | case.rings(Verdict.FRAME_GAP | USED) | case.once(swapped_stamps))
+    number = np.asarray(case["map_number"], np.int64)
+    good = (doubtful[last] == doubtful[first]) & (number[last] == number[first])
+    first, last = first[good], last[good]
+    pose, truth = np.asarray(case["pose"], np.float64)[:, :2], case.reference[:, :2]
+    mine, theirs = (np.linalg.norm(path[last] - path[first], axis=1) for path in (pose, truth))
+    return Chords(first, last, mine, theirs)
+
+
+def _parts(case: Case) -> tuple[Floats, list[Chords]]:
+    """Lengths of parts of the path over the reference's, and the parts, none shorter than the scene is deep."""
+    chords = case.once(_chords)
+    depth = np.asarray(case["scene_depth_m"], np.float64)[chords.first]
+    along = np.cumsum(chords.truth_m)
+    if not np.isfinite(depth).any() or not along[-1] > 0:
+        return np.zeros(0), []
+    count = min(SCALE_PARTS, int(chords.length.sum() / np.nanmedian(depth)))
+    if count < 1:
+        return np.zeros(0), []
+    part = np.minimum((along / along[-1] * count).astype(np.int64), count - 1)
+    parts = [Chords(*(column[part == k] for column in chords)) for k in range(count)]
+    parts = [one for one in parts if len(one.first) and one.truth_m.sum() > 0]
+    return np.array([one.length.sum() / one.truth_m.sum() for one in parts]), parts
+
+
+def _rows_of(case: Case, part: Chords) -> Bools:
+    rows = np.zeros(len(case.frame), bool)
+    for first, last in zip(part.first, part.last, strict=True):
+        rows[first : last + 1] = True
+    return rows
+
+
+def _reference_scale(case: Case, rule: Rule) -> Iterable[Finding]:
+    """Lengths of parts of the path against the reference's, relative to the first part."""
+    scale, parts = case.once(_parts)
+    if len(scale) < 2 or not scale[0] > 0:
         return
-    truth = path_lengths(case.reference[rows, :2])
-    mine = path_lengths(np.asarray(case["pose"], np.float64)[rows, :2])
-    cuts = np.searchsorted(truth, truth[-1] * np.linspace(0, 1, SCALE_PARTS + 1)[1:-1])
-    ends = np.concatenate([[0], cuts, [len(rows) - 1]])
-    lengths, theirs = np.diff(mine[ends]), np.diff(truth[ends])
-    if not (theirs > 0).all() or not lengths[0] > 0:
-        return
-    scale = lengths / theirs
     off = scale / scale[0] - 1
-    part = int(np.argmax(np.abs(off)))
-    if not abs(off[part]) > rule.thresholds["share"]:
+    worst = int(np.argmax(np.abs(off)))
+    if not abs(off[worst]) > rule.thresholds["share"]:
         return
-    shown = np.zeros(len(case.frame), bool)
-    shown[rows[ends[part] : ends[part + 1] + 1]] = True
     yield _finding(
-        case, rule, shown, int(rows[ends[part]]),
-        f"The path grows or shrinks against the reference: by {100 * off[part]:+.3g} % there since its beginning.",
-        (Evidence(name="length / reference's, since the beginning", value=float(off[part]), usual=0.0,
+        case, rule, _rows_of(case, parts[worst]), int(parts[worst].first[0]),
+        f"The path grows or shrinks against the reference: by {100 * off[worst]:+.3g} % there since its beginning.",
+        (Evidence(name="length / reference's, since the beginning", value=float(off[worst]), usual=0.0,
                   bound=rule.thresholds["share"]),),
+    )  # fmt: skip
+
+
+def _wrong_scale(case: Case, rule: Rule) -> Iterable[Finding]:
+    """Lengths of the whole path against the reference's, where they are said to be metres."""
+    scale, parts = case.once(_parts)
+    metric = case.once(Signals).accepted & (np.asarray(case["scale_known"], np.int64) != 0)
+    if not len(scale) or not metric.any():
+        return
+    off = float(np.median(scale)) - 1
+    if not abs(off) > rule.thresholds["share"]:
+        return
+    yield _finding(
+        case, rule, metric, int(parts[0].first[0]),
+        f"The path is {100 * abs(off):.3g} % too {'long' if off > 0 else 'short'} against the reference, all along.",
+        (Evidence(name="length / reference's - 1", value=off, usual=0.0, bound=rule.thresholds["share"]),),
     )  # fmt: skip
 
 
 # -------------------------------------------------------------------------------- frames, points
 
 
+def _usual(values: Floats) -> Floats:
+    """The median about each row of values [n] or [n, k]; what is missing counts as nothing."""
+    table = pd.DataFrame(values)
+    return np.asarray(table.rolling(USUAL_FRAMES, center=True, min_periods=1).median()).reshape(values.shape)
+
+
+def swapped_stamps(case: Case) -> Bools:
+    """Frames [n] that go back where the path usually goes ahead, next to a leap, again and again.
+
+    Of two frames that carry each other's stamps the later picture comes first, so that steps of -1 and +3 usual ones
+    take turns. A camera that hovers steps back, too: a usual step of 0.2 % of the scene's depth is demanded.
+    """
+    signals = case.once(Signals)
+    place = np.where(signals.accepted[:, None], np.asarray(case["position_m"], np.float64), np.nan)
+    step = np.diff(place, axis=0, prepend=np.nan)
+    usual = _usual(step)
+    length = np.linalg.norm(usual, axis=1)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        along = (step * usual).sum(axis=1) / length**2
+    back = (along < -0.3) & (length > 0.002 * np.asarray(case["scene_depth_m"], np.float64))
+    leap = along > 1.7
+    beside = np.concatenate([[False], leap[:-1]]) | np.concatenate([leap[1:], [False]])
+    swapped = back & beside
+    return swapped | np.concatenate([swapped[1:], [False]]) if swapped.sum() >= 2 else np.zeros(len(back), bool)
+
+
+def _swapped(case: Case, rule: Rule) -> Iterable[Finding]:
+    rows = case.once(swapped_stamps)
+    if rows.any():
+        yield _finding(
+            case, rule, rows, int(np.argmax(rows)),
+            f"The path goes back and leaps ahead, again and again, at {_frames(rows)}.", (),
+        )  # fmt: skip
+
+
+def _repeated(case: Case, rule: Rule) -> Iterable[Finding]:
+    """Frames whose picture is that of the frame before, to the last grey level: noise never repeats itself."""
+    if case.estimator != "semidirect":
+        return
+    grey, sharpness = (np.asarray(case[name], np.float64) for name in ("mean_grey", "sharpness"))
+    same = (np.diff(grey, prepend=np.nan) == 0) & (np.diff(sharpness, prepend=np.nan) == 0) & (sharpness > 0)
+    if same.any():
+        evidence = Evidence(name="mean grey level", value=float(grey[np.argmax(same)]), unit="grey")
+        yield _finding(
+            case, rule, same, int(np.argmax(same)), f"{_frames(same)} had the picture of the frame before.", (evidence,)
+        )
+
+
+def _sharpness(case: Case, rule: Rule) -> Iterable[Finding]:
+    """Frames that are sharper, or less sharp, than those about them."""
+    if case.estimator != "semidirect":
+        return
+    sharpness = np.asarray(case["sharpness"], np.float64)
+    lit = np.asarray(case["mean_grey"], np.float64) > rule.thresholds["grey"]
+    usual = _usual(sharpness)
+    with np.errstate(divide="ignore", invalid="ignore"):
+        ratio = np.maximum(sharpness / usual, 1e-3)
+    bound = rule.thresholds["ratio"]
+    beyond = ratio < bound if bound < 1 else ratio > bound
+    rows = lit & beyond & ~case.rings(Verdict.EXPOSURE_JUMP) & ~case.once(Signals).lost
+    if not rows.any():
+        return
+    worst = int(np.argmax(np.where(rows, np.abs(np.log(ratio)), -1.0)))
+    yield _finding(
+        case, rule, rows, worst,
+        f"The sharpness was {ratio[worst]:.3g} of the usual at the worst, in {_frames(rows)}.",
+        (Evidence(name="sharpness", value=float(sharpness[worst]), usual=float(usual[worst]),
+                  bound=float(bound * usual[worst])),),
+    )  # fmt: skip
+
+
 def _ringing(flags: Verdict, what: str, case: Case, rule: Rule) -> Iterable[Finding]:
-    """Frames with one of some alarms while the camera was not lost."""
+    """Frames with one of some alarms while the camera was not lost; `what` says it with a place for their number."""
     signals = case.once(Signals)
     rows = case.rings(flags) & ~signals.lost
     if rows.any():
         dt = np.asarray(case["dt_s"], np.float64)
         worst = int(np.argmax(np.where(rows, np.nan_to_num(dt), -1)))
         evidence = Evidence(name="dt_s", value=float(dt[worst]), unit="s", usual=signals.usual_dt())
-        yield _finding(case, rule, rows, worst, f"{what} at {_frames(rows)}.", (evidence,))
+        yield _finding(case, rule, rows, worst, what.format(_frames(rows)), (evidence,))
 
 
 def _few_points(case: Case, rule: Rule) -> Iterable[Finding]:
@@ -493,12 +652,52 @@ _OTHERS: tuple[dict[str, Any], ...] = (
         "find": _reference_scale,
     },
     {
+        "name": "wrong-scale",
+        "severity": Severity.WARNING,
+        "cause": "the focal length is wrong, or what tells the scale: unit or place of the height sensor, the speed",
+        "remedy": "calibrate the camera; compare the height with the true one, mend height_offset_m or the unit",
+        "thresholds": {"share": 0.05},
+        "find": _wrong_scale,
+    },
+    {
+        "name": "swapped-stamps",
+        "severity": Severity.WARNING,
+        "cause": "neighbouring frames carry each other's stamps",
+        "remedy": "look at the recording of the frames; --clock log where only their stamps are wrong",
+        "thresholds": {},
+        "find": _swapped,
+    },
+    {
+        "name": "repeated-frames",
+        "severity": Severity.WARNING,
+        "cause": "the camera or its driver sent a picture again with a new stamp: the motion stands still, then leaps",
+        "remedy": "look at the recording of the frames: load of the machine, driver of the camera",
+        "thresholds": {},
+        "find": _repeated,
+    },
+    {
+        "name": "blur",
+        "severity": Severity.NOTICE,
+        "cause": "the pictures are less sharp than those about them: motion while the shutter was open, or the focus",
+        "remedy": "a shorter exposure, more light, slower turns",
+        "thresholds": {"ratio": 0.75, "grey": 5.0},
+        "find": _sharpness,
+    },
+    {
+        "name": "image-noise",
+        "severity": Severity.NOTICE,
+        "cause": "the pictures are rougher than those about them: noise of a high gain, interference, damaged pictures",
+        "remedy": "more light, a lower gain; look at the pictures there",
+        "thresholds": {"ratio": 1.5, "grey": 5.0},
+        "find": _sharpness,
+    },
+    {
         "name": "frame-gap",
         "severity": Severity.WARNING,
         "cause": "frames are missing in the log, or its stamps are irregular",
         "remedy": "look at the recording of the frames: load of the machine, disk, network",
         "thresholds": {},
-        "find": functools.partial(_ringing, Verdict.FRAME_GAP, "The time since the frame before is long"),
+        "find": functools.partial(_ringing, Verdict.FRAME_GAP, "The time since the frame before is long at {}."),
     },
     {
         "name": "frames-skipped",
@@ -506,7 +705,7 @@ _OTHERS: tuple[dict[str, Any], ...] = (
         "cause": "frames are damaged, repeated, out of order or of another size",
         "remedy": "workbench inspect tells what is wrong with the recording",
         "thresholds": {},
-        "find": functools.partial(_ringing, USED, "Frames could not be used"),
+        "find": functools.partial(_ringing, USED, "{} could not be used."),
     },
     {
         "name": "exposure",
@@ -514,7 +713,7 @@ _OTHERS: tuple[dict[str, Any], ...] = (
         "cause": "the brightness of the image jumps, which the alignment takes for motion",
         "remedy": "fix the exposure, or set illumination=true",
         "thresholds": {},
-        "find": functools.partial(_ringing, Verdict.EXPOSURE_JUMP, "The mean grey level jumped"),
+        "find": functools.partial(_ringing, Verdict.EXPOSURE_JUMP, "The mean grey level jumped at {}."),
     },
     {
         "name": "few-points",
