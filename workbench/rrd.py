@@ -148,7 +148,7 @@ class SensorWriter(_Writer):
     ) -> None:
         super().__init__(path, recording_id)
         self._view = view
-        self._bounds: Bounds | None = Bounds()
+        self._bounds: Bounds | None = Bounds()  # of the view as it is to be sent, None once it is
         self._raw_images = raw_images
         self._images: list[tuple[int, int, Any, str]] = []
         self._pixels: list[tuple[int, int, NDArray[Any]]] = []

@@ -165,6 +165,7 @@ class Schema:
         return found
 
 
+@functools.cache
 def _colour(place: int, axis: int, axes: int) -> int:
     """RGBA of a series: shades of blue and orange for the two axes of a plane, else a hue of its own."""
     hue = (0.57, 0.08)[axis] if axes == 2 else 0.57 + place * 0.618
