@@ -4,9 +4,11 @@
 
 The log is an MCAP file of a simulated drive over gravel, 512 x 512. Decoding alone reads it and decodes every image to
 grey in as many threads as there are cores; the whole job replays it with the preset `best` and logs everything. The
-best of the passes is told, in frames a second by the clock and in CPU time a frame, with the shares of the manifest and
-of the estimator, which gets images that are decoded already. Decoding and the estimator together bound the whole job:
-however well they overlap, and were nothing logged at all, it cannot be faster than their CPU time on all cores.
+least of the passes is told, in frames a second by the clock and in CPU time a frame, with the shares of the manifest
+and of the estimator, which gets images that are decoded already. Two bounds of the share are told besides, both from
+CPU time, which a busy machine blurs less than the clock: of the whole job as it is, whose calling thread runs the
+estimator and the log one after the other while images are decoded and files written in other threads; and of decoding
+and the estimator alone on all cores, as if nothing were read, logged or judged.
 Bar: the whole job at 80 % of the rate of decoding alone. Run it on a machine that has nothing else to do.
 """
 
@@ -17,10 +19,10 @@ import os
 import tempfile
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 
@@ -38,11 +40,25 @@ from workbench.writers import write
 BAR = 0.8
 
 
-def timed(work: Callable[[], Any]) -> tuple[float, float]:
-    """Seconds by the clock, and of CPU."""
-    wall_s, cpu_s = time.perf_counter(), time.process_time()
+class Cost(NamedTuple):
+    """Seconds by the clock, of CPU in all threads, and of CPU in the calling thread."""
+
+    wall_s: float
+    cpu_s: float
+    thread_s: float
+
+
+def timed(work: Callable[[], Any]) -> Cost:
+    """What some work costs."""
+    before = time.perf_counter(), time.process_time(), time.thread_time()
     work()
-    return time.perf_counter() - wall_s, time.process_time() - cpu_s
+    after = time.perf_counter(), time.process_time(), time.thread_time()
+    return Cost(*(b - a for a, b in zip(before, after, strict=True)))
+
+
+def least(costs: Sequence[Cost]) -> Cost:
+    """The least of each."""
+    return Cost(*map(min, zip(*costs, strict=True)))
 
 
 def made_log(file: Path, frames: int, raw: bool) -> None:
@@ -95,24 +111,25 @@ def main() -> None:
         made_log(log, chosen.frames, chosen.raw)
         request = Request(path=log, out=folder / "run", overrides=("metres_per_px=0.001",))
         run(request)  # compiles what it needs
-        alone = min(timed(lambda: decode(log, cores)) for _ in range(chosen.passes))
+        alone = least([timed(lambda: decode(log, cores)) for _ in range(chosen.passes)])
         whole = []
         for k in range(chosen.passes):
             fresh = Request(path=log, out=folder / f"run{k}", overrides=request.overrides)
             whole.append(timed(lambda fresh=fresh: run(fresh)))  # type: ignore[misc]
         listed = timed(lambda: manifest.taken(folder / "run", "best"))
-        best = min(whole)
+        best = least(whole)
         stepping = estimator_alone(log, request)
-        stepped = min((timed(stepping) for _ in range(chosen.passes)), key=lambda pair: pair[1])
+        stepped = least([timed(stepping) for _ in range(chosen.passes)])
         named = {"decoding alone": alone, "whole job": best, "of it, estimator": stepped, "of it, manifest": listed}
-        for title, (wall_s, cpu_s) in named.items():
-            rate, cost = chosen.frames / wall_s, 1e3 * cpu_s / chosen.frames
-            print(f"{title:16} {rate:9.1f} frames/s  {cost:7.3f} ms of CPU a frame")
-        share = alone[0] / best[0]
-        bound = alone[1] / (alone[1] + stepped[1])
+        for title, cost in named.items():
+            rate, (cpu_ms, thread_ms) = chosen.frames / cost.wall_s, (1e3 * s / chosen.frames for s in cost[1:])
+            print(f"{title:16} {rate:9.1f} frames/s {cpu_ms:8.3f} ms of CPU a frame, {thread_ms:.3f} in one thread")
+        share = alone.wall_s / best.wall_s
+        idle = alone.cpu_s / cores / max(best.thread_s, best.cpu_s / cores)
+        bound = alone.cpu_s / (alone.cpu_s + stepped.cpu_s)
         verdict = "met" if share >= BAR else "not met"
         print(f"whole job at {share:.0%} of decoding alone on {cores} cores (bar {BAR:.0%}: {verdict})")
-        print(f"bound by the CPU time of decoding and estimator: {bound:.0%} of decoding alone")
+        print(f"by CPU time at most {idle:.0%}; decoding and estimator, nothing else, at most {bound:.0%}")
 
 
 if __name__ == "__main__":

@@ -223,6 +223,46 @@ def test_buffers_stay_small(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> 
             assert sensors._bytes <= rrd.MAX_BYTES
 
 
+def test_full_buffers_are_sent_at_once_and_old_ones_are_waited_for(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    sent: list[str] = []
+    waited = 0
+    send, flush = rrd.RrdFile.send, rrd.RrdFile.flush
+
+    def noted(file: Any, entity: str, *columns: Any) -> None:
+        sent.append(entity)
+        send(file, entity, *columns)
+
+    def counted(file: Any) -> None:
+        nonlocal waited
+        waited += 1
+        flush(file)
+
+    monkeypatch.setattr(rrd.RrdFile, "send", noted)
+    monkeypatch.setattr(rrd.RrdFile, "flush", counted)
+    monkeypatch.setattr(rrd, "MAX_AGE_S", math.inf)
+    image = ImageSample(stream="i", t_ns=0, received_ns=0, encoding="jpeg", payload=bytes(rrd.MAX_BYTES // 2))
+    path = tmp_path / "sensors.rrd"
+    with rrd.SensorWriter(path, recording_id="mission") as sensors:
+        sensors.reference(fake_steps.reference(9))
+        sent.clear()
+        for frame in range(8):
+            one = dataclasses.replace(image, t_ns=fake_steps.t_of(frame), frame=frame)
+            sensors.sample(one, one)
+            sensors.image(frame, one)
+        assert set(sent) == {rrd.IMAGE}  # large, while the rows beside them are few
+        assert len(sent) > 1
+        assert waited == 0
+        monkeypatch.setattr(rrd, "MAX_AGE_S", -1.0)
+        sensors.image(8, dataclasses.replace(image, t_ns=fake_steps.t_of(8), frame=8))
+        assert waited == 1
+        assert "/sensors/streams/i" in sent
+    assert sorted(rows_of(path, rrd.IMAGE, "EncodedImage:blob")) == list(range(9))
+    assert sorted(rows_of(path, f"{rrd.REFERENCE}/pose", "Points3D:positions")) == list(range(9))
+    assert sorted(rows_of(path, "/sensors/streams/i", "Sample:order")) == list(range(8))
+
+
 def test_a_frame_costs_at_most_25_kb_beyond_its_image(tmp_path: Path) -> None:
     path = write_run(tmp_path / "run.rrd", fake_steps.steps(300))
     assert path.stat().st_size / 300 < 25_000

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import colorsys
+import functools
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
@@ -527,7 +528,9 @@ def _image(
     )
 
 
+@functools.lru_cache(maxsize=4)
 def _axis(frames: tuple[int, int] | None) -> rrb.TimeAxis:
+    """The axis of time that all plots of a view share."""
     first, last = (rr.TimeRangeBoundary.infinite(),) * 2 if frames is None else map(_absolute, frames)
     return rrb.TimeAxis(view_range=rr.TimeRange(start=first, end=last))
 

@@ -20,6 +20,7 @@ import re
 import subprocess
 import sys
 from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -125,13 +126,12 @@ def taken(folder: Path, run: str, count_rows: CountRows = stored_rows) -> Manife
     Raises:
         RecordingError: a file that was just written cannot be read back.
     """
-    made = Manifest()
-    for file in (*(folder / f"{run}.{suffix}" for suffix in SUFFIXES), folder / SENSORS):
-        if file.is_file():
-            made.digests[file.name] = digest_of(file)
-            if file.suffix == ".rrd":
-                made.rows[file.name] = dict(count_rows(file))
-    return made
+    named = (*(folder / f"{run}.{suffix}" for suffix in SUFFIXES), folder / SENSORS)
+    files = [file for file in named if file.is_file()]
+    with ThreadPoolExecutor(1) as other:  # digests do not need the interpreter while rows are counted
+        digests = other.map(digest_of, files)
+        rows = {file.name: dict(count_rows(file)) for file in files if file.suffix == ".rrd"}
+        return Manifest({file.name: digest for file, digest in zip(files, digests, strict=True)}, rows)
 
 
 def read(folder: Path, run: str) -> Manifest:

@@ -35,6 +35,7 @@ from pipelines.verdict import Severity, Verdict
 from readers.streams import ImageError, ImageSample, PoseSample, RecordingError, Sample
 from workbench import traces
 from workbench.blueprints import Bounds, Extent, blueprint_of, sensor_blueprint
+from workbench.rrd_columns import blobs, columns, lists, own_columns, repeated
 from workbench.rrd_correlation import CorrelationDrawing
 from workbench.rrd_drawing import Drawing
 from workbench.rrd_file import APPLICATION as APPLICATION
@@ -45,10 +46,8 @@ from workbench.rrd_file import (
     REFERENCE,
     RrdFile,
     arrow,
-    blobs,
     document,
     flat,
-    lists,
     marker,
     numbers,
     texts,
@@ -109,9 +108,12 @@ class _Writer(abc.ABC):
             self._write()
             self._file.close()
 
-    def _flush_if(self, full: bool) -> None:
-        if full or time.monotonic() - self._sent > MAX_AGE_S:
+    def _write_if(self, full: bool) -> None:
+        """Send what is buffered where that is much; where it is old, wait until it is written, too."""
+        if time.monotonic() - self._sent > MAX_AGE_S:
             self.flush()
+        elif full:
+            self._write()
 
     @abc.abstractmethod
     def _write(self) -> None:
@@ -146,7 +148,7 @@ class SensorWriter(_Writer):
     ) -> None:
         super().__init__(path, recording_id)
         self._view = view
-        self._file.blueprint(view(Bounds()))
+        self._bounds: Bounds | None = Bounds()  # of the view as it is to be sent, None once it is
         self._raw_images = raw_images
         self._images: list[tuple[int, int, Any, str]] = []
         self._pixels: list[tuple[int, int, NDArray[Any]]] = []
@@ -172,19 +174,21 @@ class SensorWriter(_Writer):
             else:
                 self._encoded(frame, sample.t_ns, _png(pixels, sample), "image/png")
         self._frames.append((frame, sample.t_ns))
-        self._flush_if(self._bytes > MAX_BYTES or len(self._frames) >= MAX_ROWS)
+        if self._bytes > MAX_BYTES:
+            self._write_images()
+        self._write_if(len(self._frames) >= MAX_ROWS)
 
     def sample(self, original: Sample, decoded: Sample) -> None:
         """Log the next sample in the order of arrival, as it was stored and as the estimator got it."""
         self._samples.add(original, decoded)
-        self._flush_if(self._samples.bytes > MAX_BYTES or len(self._samples) >= MAX_SAMPLES)
+        self._write_if(self._samples.bytes > MAX_BYTES or len(self._samples) >= MAX_SAMPLES)
 
     def undecodable(self, frame: int, t_ns: int, reason: str) -> None:
         """Log that a frame has no image, and why; the viewer then shows none."""
         self._write()
         at = np.array([frame]), np.array([t_ns])
         self._file.send("/camera/problems", *at, texts([traces.Event(frame, Severity.ERROR, reason)]))
-        self._file.send(IMAGE, *at, rr.Clear.columns(is_recursive=[False]))
+        self._file.send(IMAGE, *at, columns(rr.Clear, is_recursive=[False]))
 
     def reference(self, poses: Sequence[PoseSample]) -> None:
         """Log the reference: its path, its numbers, and from now on its pose at every image's time."""
@@ -198,7 +202,7 @@ class SensorWriter(_Writer):
         extent = Extent.of(position[:, :2])
         self._arrow_m = extent.size_m * ARROW_SHARE
         self._file.scale_bar(extent)
-        self._file.blueprint(self._view(Bounds(extent=extent)))
+        self._bounds = Bounds(extent=extent)
         points = flat(position[:, :2], "reference")
         path = rr.LineStrips3D([points], colors=COLOURS["reference"], radii=rr.Radius.ui_points(2.5))
         self._file.static(f"{REFERENCE}/path", path)
@@ -206,8 +210,8 @@ class SensorWriter(_Writer):
         self._file.static(f"{REFERENCE}/heading", arrow("reference", 3))
         names = ["x [m]", "y [m]", "z [m]", "heading [rad]"]
         self._file.static("/sensors/reference", rr.SeriesLines(names=names))
-        values = rr.Scalars.columns(scalars=np.column_stack([position, heading]))
-        self._file.send("/sensors/reference", None, t_ns, values)
+        values = np.column_stack([position, heading])
+        self._file.send("/sensors/reference", None, t_ns, columns(rr.Scalars, scalars=values))
 
     def facts(self, lines: Iterable[str]) -> None:
         """Log facts of the recording, one Markdown line each."""
@@ -218,18 +222,27 @@ class SensorWriter(_Writer):
         self._bytes += len(data)
 
     def _write(self) -> None:
+        if self._bounds is not None:
+            self._file.blueprint(self._view(self._bounds))
+            self._bounds = None
+        self._write_images()
         self._samples.write()
-        if self._images:
-            frames, t_ns, data, media = zip(*self._images, strict=True)
-            columns = rr.EncodedImage.columns(blob=blobs(data), media_type=list(media))
-            self._file.send(IMAGE, np.array(frames), np.array(t_ns), columns)
-        for frame, when, pixels in self._pixels:
-            columns = rr.Image.columns(buffer=[pixels.tobytes()], format=[_format(pixels)])
-            self._file.send(IMAGE, np.array([frame]), np.array([when]), columns)
         if self._frames and self._reference is not None:
             frames, t_ns = np.array(self._frames, np.int64).T
             self._write_reference(frames, t_ns, *self._reference)
-        self._images, self._pixels, self._frames, self._bytes = [], [], [], 0
+        self._frames = []
+
+    def _write_images(self) -> None:
+        """Send the images alone: they are many bytes long before they are many rows."""
+        if self._images:
+            frames, t_ns, data, media = zip(*self._images, strict=True)
+            images = columns(rr.EncodedImage, blob=blobs(data), media_type=media)
+            self._file.send(IMAGE, np.array(frames), np.array(t_ns), images)
+        for frame, when, pixels in self._pixels:
+            buffer = columns(rr.Image, buffer=blobs([pixels.tobytes()]))
+            form = repeated(rr.Image, 1, format=_format(pixels))
+            self._file.send(IMAGE, np.array([frame]), np.array([when]), buffer, form)
+        self._images, self._pixels, self._bytes = [], [], 0
 
     def _write_reference(self, frames: Ints, t_ns: Ints, at_ns: Ints, position: Floats, heading: Floats) -> None:
         inside = (t_ns >= at_ns[0]) & (t_ns <= at_ns[-1])
@@ -237,10 +250,10 @@ class SensorWriter(_Writer):
         since, known = (t_ns - at_ns[0]).astype(float), (at_ns - at_ns[0]).astype(float)
         x, y, alpha = (np.interp(since, known, values) for values in (position[:, 0], position[:, 1], heading))
         points = flat(np.column_stack([x, y]), "reference")
-        self._file.send(f"{REFERENCE}/pose", frames, t_ns, rr.Points3D.columns(positions=points))
+        self._file.send(f"{REFERENCE}/pose", frames, t_ns, columns(rr.Points3D, positions=points))
         vectors = flat(self._arrow_m * np.column_stack([np.cos(alpha), np.sin(alpha)]))
         good = np.isfinite(vectors).all(axis=1)
-        arrows = rr.Arrows3D.columns(vectors=vectors[good], origins=points[good])
+        arrows = columns(rr.Arrows3D, vectors=vectors[good], origins=points[good])
         self._file.send(f"{REFERENCE}/heading", frames[good], t_ns[good], arrows)
 
 
@@ -321,21 +334,21 @@ class RunWriter(_Writer):
             self._legends(step)
         self._steps.append(step)
         self._beside.append(beside)
-        self._flush_if(len(self._steps) >= self._capacity)
+        self._write_if(len(self._steps) >= self._capacity)
 
     def event(self, frame: int, t_ns: int, severity: Severity, text: str) -> None:
         """Log something worth stepping to that no verdict says."""
-        columns = texts([traces.Event(0, severity, text)])
-        self._file.send(f"{self._root}/events", np.array([frame]), np.array([t_ns]), columns)
+        line = texts([traces.Event(0, severity, text)])
+        self._file.send(f"{self._root}/events", np.array([frame]), np.array([t_ns]), line)
 
     def errors(self, frames: Ints, t_ns: Ints, values: Floats) -> None:
         """Log the errors against the reference: x, y, distance (m), heading (rad) [n, 4] at frames and times [n]."""
         names = ["x [m]", "y [m]", "distance [m]", "heading [rad]"]
         colours = np.array([0x42A5F5FF, 0xFFB74DFF, 0xFFFFFFFF, 0x42A5F5FF], np.uint32)
         self._file.static(f"{self._root}/error", rr.SeriesLines(names=names, colors=colours))
-        columns = rr.Scalars.columns(scalars=np.asarray(values, np.float64))
         self._told |= {"error"} if np.isfinite(values).any() else set()
-        self._file.send(f"{self._root}/error", np.asarray(frames, np.int64), np.asarray(t_ns, np.int64), columns)
+        rows = columns(rr.Scalars, scalars=values)
+        self._file.send(f"{self._root}/error", np.asarray(frames, np.int64), np.asarray(t_ns, np.int64), rows)
 
     def smoothed(self, slot: int, frames: Ints, t_ns: Ints, mean: Floats, covariance: Floats) -> None:
         """Log what smoothing says of the landmarks in a slot, at n of its frames.
@@ -399,13 +412,12 @@ class RunWriter(_Writer):
 
     def _values(self, table: traces.Columns) -> None:
         for entity, values in traces.scalar_groups(self._schema, table):
-            counts = np.full(len(values), values.shape[1])
             if entity not in self._told and np.nan_to_num(values).any():
                 self._told.add(entity)
-            self._send(entity, table, rr.Scalars.columns(scalars=values.ravel()).partition(counts))
+            self._send(entity, table, columns(rr.Scalars, scalars=values))
         for entity, rows in self._schema.of(Archetype.INTEGERS).items():
             integers = {row.field: table[row.field] for row in rows}
-            self._send(entity, table, rr.DynamicArchetype.columns(Archetype.INTEGERS.value, components=integers))
+            self._send(entity, table, own_columns(Archetype.INTEGERS.value, integers))
         for entity, rows in self._schema.of(Archetype.LISTS).items():
             joined = {row.field: traces.Joined.of(table[row.field]) for row in rows}
             self._send(entity, table, lists(Archetype.LISTS.value, joined))
@@ -419,7 +431,7 @@ class RunWriter(_Writer):
         at = np.array([row for row, _, _ in changes])
         frames, t_ns = table["frame"][at], table["t_ns"][at]
         names = [str(verdict.name) for _, verdict, _ in changes]
-        self._file.send(f"{self._root}/verdict", frames, t_ns, rr.StateChange.columns(state=names))
+        self._file.send(f"{self._root}/verdict", frames, t_ns, columns(rr.StateChange, state=names))
         for row, _, alarms in changes:
             self._alarm_lanes(int(table["frame"][row]), int(table["t_ns"][row]), alarms)
 
@@ -435,7 +447,7 @@ class RunWriter(_Writer):
                 self._file.static(entity, rr.StateConfiguration(values=[name], labels=[name], colors=[colour]))
             self._lanes[flag] = rings
             state = str(flag.name) if rings else ""
-            self._file.send(entity, np.array([frame]), np.array([t_ns]), rr.StateChange.columns(state=[state]))
+            self._file.send(entity, np.array([frame]), np.array([t_ns]), columns(rr.StateChange, state=[state]))
 
     def _log(self, entity: str, table: traces.Columns, events: Sequence[traces.Event]) -> None:
         if events:

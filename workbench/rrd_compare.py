@@ -12,6 +12,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from workbench.blueprints import Extent, compare_blueprint
+from workbench.rrd_columns import columns
 from workbench.rrd_file import RrdFile, flat
 
 Floats = NDArray[np.float64]
@@ -80,4 +81,4 @@ class DifferenceWriter:
             entity = f"/compare/{name}/{run}"
             lines = rr.SeriesLines(names=[f"{run} from {other}"], colors=np.array([self._colour(run)], np.uint32))
             self._file.static(entity, lines)
-            self._file.send(entity, frame, t_ns, rr.Scalars.columns(scalars=difference[:, k]))
+            self._file.send(entity, frame, t_ns, columns(rr.Scalars, scalars=difference[:, k]))

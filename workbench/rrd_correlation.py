@@ -10,6 +10,7 @@ import rerun as rr
 
 from workbench import traces
 from workbench.blueprints import Extent
+from workbench.rrd_columns import columns, repeated
 from workbench.rrd_drawing import Drawing
 from workbench.rrd_file import (
     ARROW_SHARE,
@@ -18,10 +19,8 @@ from workbench.rrd_file import (
     Ints,
     RrdFile,
     arrow,
-    blobs,
     flat,
     marker,
-    repeated,
 )
 from workbench.schema import Schema
 
@@ -83,54 +82,54 @@ class CorrelationDrawing(Drawing):
         self._overlays(table)
         self._map(table)
         texts = traces.numbers(table)
-        media = repeated(rr.TextDocument.columns(media_type=["text/markdown"]), len(texts))
-        self.send("numbers", table, rr.TextDocument.columns(text=texts), media)
+        media = repeated(rr.TextDocument, len(texts), media_type="text/markdown")
+        self.send("numbers", table, columns(rr.TextDocument, text=texts), media)
 
     def _surfaces(self, table: traces.Columns) -> None:
         root = f"{self.root}/{self.schema.entity('surface')}"
         for group in traces.mosaics(table):
             frames, t_ns = table["frame"][group.rows], table["t_ns"][group.rows]
             n, height, width = group.images.shape
-            buffers = blobs(list(group.images.view(np.uint8).reshape(n, -1)))
+            buffers = group.images.view(np.uint8).reshape(n, -1)
             format_ = rr.components.ImageFormat(width=width, height=height, color_model="L", channel_datatype="F16")
             self.file.send(
                 root, frames, t_ns,
-                rr.DepthImage.columns(buffer=buffers),
-                repeated(rr.DepthImage.columns(format=[format_]), n),
+                columns(rr.DepthImage, buffer=buffers), repeated(rr.DepthImage, n, format=format_),
             )  # fmt: skip
             for name, points in (("second", group.second), ("first", group.first)):
                 marks = traces.shapes(points, points)
-                columns = rr.Points2D.columns(positions=marks.points).partition(marks.counts)
-                self.file.send(f"{root}/{name}", frames, t_ns, columns)
+                drawn = columns(rr.Points2D, marks.counts, positions=marks.points)
+                self.file.send(f"{root}/{name}", frames, t_ns, drawn)
             if group.corners.tobytes() != self._arrangement:
                 self._arrangement = group.corners.tobytes()
                 labels = [str(k + 1) for k in range(len(group.corners))]
-                columns = rr.Points2D.columns(positions=group.corners + 1.5, labels=labels).partition([len(labels)])
-                self.file.send(f"{root}/labels", frames[:1], t_ns[:1], columns)
+                names = columns(rr.Points2D, [len(labels)], positions=group.corners + 1.5, labels=labels)
+                self.file.send(f"{root}/labels", frames[:1], t_ns[:1], names)
 
     def _overlays(self, table: traces.Columns) -> None:
         for name, drawn in traces.overlays(table).items():
             colours: dict[str, Any] = {} if drawn.colours is None else {"colors": drawn.colours}
+            kind: Any
             match name:
                 case "shifts":
-                    columns = rr.Arrows2D.columns(origins=drawn.points, vectors=drawn.extents, **colours)
+                    kind, at = rr.Arrows2D, {"origins": drawn.points, "vectors": drawn.extents}
                 case "tiles":
-                    columns = rr.Points2D.columns(positions=drawn.points, **colours)
+                    kind, at = rr.Points2D, {"positions": drawn.points}
                 case _:
-                    columns = rr.Boxes2D.columns(centers=drawn.points, half_sizes=drawn.extents, **colours)
-            self.send(f"{self.image}/{name}", table, columns.partition(drawn.counts))
+                    kind, at = rr.Boxes2D, {"centers": drawn.points, "half_sizes": drawn.extents}
+            self.send(f"{self.image}/{name}", table, columns(kind, drawn.counts, **at, **colours))
 
     def _map(self, table: traces.Columns) -> None:
         raw, pose = table["pose_raw"], table["pose"]
         colours = traces.verdict_colours(table["verdict"], COLOURS["corrected"])
         at, on_top = (flat(pose[:, :2], layer) for layer in ("corrected", "markers"))
-        self.send(f"{self.world}/raw", table, rr.Points3D.columns(positions=flat(raw[:, :2], "raw")))
-        self.send(f"{self.world}/corrected", table, rr.Points3D.columns(positions=at, colors=colours))
-        self.send(f"{self.world}/body", table, rr.Points3D.columns(positions=on_top))
+        self.send(f"{self.world}/raw", table, columns(rr.Points3D, positions=flat(raw[:, :2], "raw")))
+        self.send(f"{self.world}/corrected", table, columns(rr.Points3D, positions=at, colors=colours))
+        self.send(f"{self.world}/body", table, columns(rr.Points3D, positions=on_top))
         half, angle = traces.ellipses(table["pose_covariance"])
         turn = np.column_stack([np.zeros((len(at), 2)), np.sin(angle / 2), np.cos(angle / 2)])
-        columns = rr.Ellipsoids3D.columns(half_sizes=flat(np.nan_to_num(half)), centers=at, quaternions=turn)
-        self.send(f"{self.world}/covariance", table, columns)
+        ellipses = columns(rr.Ellipsoids3D, half_sizes=flat(np.nan_to_num(half)), centers=at, quaternions=turn)
+        self.send(f"{self.world}/covariance", table, ellipses)
         self._path.append((table["frame"], table["t_ns"], raw, pose))
 
     # ---- the end
@@ -147,7 +146,7 @@ class CorrelationDrawing(Drawing):
         good = np.isfinite(pose).all(axis=1)
         self.file.scale_bar(extent)
         vectors = ARROW_SHARE * extent.size_m * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
-        arrows = rr.Arrows3D.columns(vectors=flat(vectors[good]), origins=flat(pose[good, :2], "arrows"))
+        arrows = columns(rr.Arrows3D, vectors=flat(vectors[good]), origins=flat(pose[good, :2], "arrows"))
         self.file.send(f"{self.world}/heading", frames[good], t_ns[good], arrows)
         return {"extent": extent}
 

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import math
-from collections.abc import Iterable, Mapping, Sequence
+import itertools
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +16,7 @@ from pipelines.verdict import Severity
 from readers.streams import RecordingError, WorkbenchError
 from workbench import traces
 from workbench.blueprints import Extent
+from workbench.rrd_columns import columns
 from workbench.safe_text import printable
 
 APPLICATION = "estimator_workbench"
@@ -51,6 +52,9 @@ class RrdFile:
             raise RecordingError(path, f"cannot be written ({error})", "choose another folder with -o") from error
         self._rec.set_log_time_enabled(False)
         self._rec.set_log_tick_enabled(False)
+        self._frames: Ints | None = None
+        self._t_ns: Ints | None = None
+        self._times: list[rr.TimeColumn] = []
         self.static("/world", rr.ViewCoordinates.RIGHT_HAND_Z_UP)
 
     def static(self, entity: str, *what: rr.AsComponents) -> None:
@@ -60,10 +64,16 @@ class RrdFile:
     def send(self, entity: str, frames: Ints | None, t_ns: Ints, *columns: Iterable[Any]) -> None:
         """Log rows of one entity at sensor times [n] and at frames [n], where they belong to frames."""
         if len(t_ns):
-            times = [rr.TimeColumn("sensor_time", timestamp=np.asarray(t_ns, np.int64).view("datetime64[ns]"))]
+            self._rec.send_columns(entity, self._at(frames, t_ns), itertools.chain(*columns), strict=True)
+
+    def _at(self, frames: Ints | None, t_ns: Ints) -> list[rr.TimeColumn]:
+        """The columns of times; most entities share those of the one before."""
+        if frames is not self._frames or t_ns is not self._t_ns:
+            self._frames, self._t_ns = frames, t_ns
+            self._times = [rr.TimeColumn("sensor_time", timestamp=np.asarray(t_ns, np.int64).view("datetime64[ns]"))]
             if frames is not None:
-                times.append(rr.TimeColumn("frame", sequence=frames))
-            self._rec.send_columns(entity, times, [c for group in columns for c in group], strict=True)
+                self._times.append(rr.TimeColumn("frame", sequence=frames))
+        return self._times
 
     def scale_bar(self, extent: Extent) -> None:
         """Draw a round length below the map."""
@@ -88,44 +98,6 @@ class RrdFile:
         self._rec.disconnect()
 
 
-def blobs(items: Sequence[Any]) -> Any:
-    """Buffers of bytes as one Arrow array of blobs, copied once."""
-    parts = [np.frombuffer(item, np.uint8) for item in items]
-    offsets = np.cumsum([0, *map(len, parts)], dtype=np.int32)
-    kind = rr.components.BlobBatch._ARROW_DATATYPE
-    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(np.concatenate(parts)), type=kind)
-
-
-def repeated(column: rr.ComponentColumnList, count: int) -> rr.ComponentColumnList:
-    """A column of one row, `count` times."""
-    repeated = []
-    for one in column:
-        values = one.component_batch.as_arrow_array().take(pa.array(np.zeros(count, np.int64)))
-        repeated.append(rr.ComponentColumn(one.component_descriptor(), _Arrow(values)))
-    return rr.ComponentColumnList(repeated)
-
-
-def lists(archetype: str, components: Mapping[str, traces.Joined]) -> rr.ComponentColumnList:
-    """Components whose rows differ in length, also where all of them are empty; int64 or float64 as they are."""
-    made = []
-    for name, joined in components.items():
-        flat = np.ascontiguousarray(joined.values).reshape(-1)
-        width = math.prod(joined.values.shape[1:])
-        descriptor = rr.ComponentDescriptor(name).with_builtin_archetype(archetype)
-        made.append(rr.ComponentColumn(descriptor, _Arrow(pa.array(flat))).partition(joined.counts * width))
-    return rr.ComponentColumnList(made)
-
-
-class _Arrow:
-    """An Arrow array where Rerun wants a batch."""
-
-    def __init__(self, values: pa.Array) -> None:
-        self._values = values
-
-    def as_arrow_array(self) -> pa.Array:
-        return self._values
-
-
 def numbers(column: pa.Array) -> NDArray[Any]:
     """An Arrow array of numbers or times as it lies in memory, times as int64; read-only.
 
@@ -142,9 +114,9 @@ def numbers(column: pa.Array) -> NDArray[Any]:
     return np.frombuffer(data, dtype, len(column), column.offset * dtype.itemsize)
 
 
-def texts(events: Sequence[traces.Event]) -> rr.ComponentColumnList:
+def texts(events: Sequence[traces.Event]) -> list[rr.ComponentColumn]:
     """Lines of a log."""
-    return rr.TextLog.columns(text=[printable(e.text) for e in events], level=[LEVELS[e.severity] for e in events])
+    return columns(rr.TextLog, text=[printable(e.text) for e in events], level=[LEVELS[e.severity] for e in events])
 
 
 def flat(points: Floats, layer: str = "") -> NDArray[np.float32]:

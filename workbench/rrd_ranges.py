@@ -13,8 +13,9 @@ from workbench import range_traces as ranges
 from workbench import traces
 from workbench.blueprints import Extent
 from workbench.range_traces import Beside, RangeScene
+from workbench.rrd_columns import columns, repeated
 from workbench.rrd_drawing import Drawing
-from workbench.rrd_file import ARROW_SHARE, COLOURS, Floats, Ints, RrdFile, arrow, document, flat, marker, repeated
+from workbench.rrd_file import ARROW_SHARE, COLOURS, Floats, Ints, RrdFile, arrow, document, flat, marker
 from workbench.schema import Schema
 
 CHI2 = (5.991, ranges.GATE)
@@ -113,8 +114,8 @@ class RangeDrawing(Drawing):
         self._from_above(table, camera)
         self._plots(table, reference)
         texts = ranges.numbers(table, reference)
-        media = repeated(rr.TextDocument.columns(media_type=["text/markdown"]), n)
-        self.send("numbers", table, rr.TextDocument.columns(text=texts), media)
+        media = repeated(rr.TextDocument, n, media_type="text/markdown")
+        self.send("numbers", table, columns(rr.TextDocument, text=texts), media)
 
     def _remember(self, table: traces.Columns, camera: Floats, reference: Floats) -> None:
         """What the views at the end need: the way, who was in which slot, and how far the plots reach."""
@@ -134,12 +135,13 @@ class RangeDrawing(Drawing):
         self._points2d("measured", table, measured, seen, colors=colours[seen])
         self._points2d("predicted", table, predicted, foreseen)
         both = seen & foreseen
-        arrows = rr.Arrows2D.columns(origins=predicted[both], vectors=(measured - predicted)[both])
-        self.send(f"{self.image}/innovation", table, arrows.partition(both.sum(axis=1)))
+        shifts = (measured - predicted)[both]
+        arrows = columns(rr.Arrows2D, both.sum(axis=1), origins=predicted[both], vectors=shifts)
+        self.send(f"{self.image}/innovation", table, arrows)
         spread = table["innovation_covariance"]
         gated = foreseen & traces.finite(spread, (2, 3))
-        strips = ranges.gates(predicted[gated], spread[gated]).astype(np.float32)
-        self.send(f"{self.image}/gate", table, rr.LineStrips2D.columns(strips=strips).partition(gated.sum(axis=1)))
+        strips = ranges.gates(predicted[gated], spread[gated])
+        self.send(f"{self.image}/gate", table, columns(rr.LineStrips2D, gated.sum(axis=1), strips=strips))
         where = np.where(seen[..., None], measured, ranges.shown(table["mean"][..., :2], self.scene))
         carried = traces.finite(where, 2) & np.asarray(table["outcome"] != Outcome.LOST)
         if carried.shape[1] <= ranges.LISTED:
@@ -152,68 +154,60 @@ class RangeDrawing(Drawing):
         return table["measured_px"], table["prior"][..., :2]
 
     def _points2d(self, name: str, table: traces.Columns, points: Floats, chosen: Any, **more: Any) -> None:
-        columns = rr.Points2D.columns(positions=points[chosen], **more)
-        self.send(f"{self.image}/{name}", table, columns.partition(chosen.sum(axis=1)))
+        drawn = columns(rr.Points2D, chosen.sum(axis=1), positions=points[chosen], **more)
+        self.send(f"{self.image}/{name}", table, drawn)
 
     def _labels(self, table: traces.Columns, where: Floats, carried: Any) -> None:
         """Numbers and ranges; those of many landmarks would hide the image and show only under the mouse."""
         count = carried.sum(axis=1)
         colours = ranges.status_colours(table["status"][carried])
-        columns = rr.Points2D.columns(positions=where[carried], colors=colours, labels=ranges.labels(table, carried))
-        shown = rr.Points2D.columns(show_labels=count <= ranges.LABELLED)
-        self.send(f"{self.image}/labels", table, columns.partition(count), shown)
+        labels = ranges.labels(table, carried)
+        drawn = columns(rr.Points2D, count, positions=where[carried], colors=colours, labels=labels)
+        shown = columns(rr.Points2D, show_labels=count <= ranges.LABELLED)
+        self.send(f"{self.image}/labels", table, drawn, shown)
 
     def _focus(self, table: traces.Columns) -> None:
         """A cross where the camera moves to."""
         at = ranges.shown(table["focus_px"][:, None, :], self.scene)[:, 0]
         good = traces.finite(at, 1)
         arm = np.array([[[-6.0, 0], [6.0, 0]], [[0, -6.0], [0, 6.0]]])
-        strips = (at[good][:, None, None, :] + arm).reshape(-1, 2, 2).astype(np.float32)
-        self.send(f"{self.image}/focus", table, rr.LineStrips2D.columns(strips=strips).partition(2 * good))
+        strips = (at[good][:, None, None, :] + arm).reshape(-1, 2, 2)
+        self.send(f"{self.image}/focus", table, columns(rr.LineStrips2D, 2 * good, strips=strips))
 
     def _from_above(self, table: traces.Columns, camera: Floats) -> None:
         above = ranges.from_above(table, camera, self.scene)
         world = f"{self.world}/landmarks"
         self._reach.append(above.points[above.sure])
-        points = rr.Points3D.columns(positions=flat(above.points, "corrected"), colors=above.colours)
-        self.send(f"{world}/points", table, points.partition(above.counts))
+        places = flat(above.points, "corrected")
+        self.send(f"{world}/points", table, columns(rr.Points3D, above.counts, positions=places, colors=above.colours))
         strips = flat(above.rays.reshape(-1, 2), "raw").reshape(-1, 2, 3)
         faint = (above.colours & np.uint32(0xFFFFFF00)) | np.uint32(0x90)
-        rays = rr.LineStrips3D.columns(strips=strips, colors=faint)
-        self.send(f"{world}/rays", table, rays.partition(above.counts))
+        self.send(f"{world}/rays", table, columns(rr.LineStrips3D, above.counts, strips=strips, colors=faint))
         self._ellipses(f"{world}/ellipses", table, above)
         known = traces.finite(camera, (1, 2))
         there = {"frame": table["frame"][known], "t_ns": table["t_ns"][known]}
-        columns = rr.Points3D.columns(positions=flat(camera[known, :2, 3], "markers"))
-        self.send(f"{self.world}/camera", there, columns)
+        self.send(f"{self.world}/camera", there, columns(rr.Points3D, positions=flat(camera[known, :2, 3], "markers")))
 
     def _ellipses(self, entity: str, table: traces.Columns, above: ranges.Above) -> None:
         sure = above.sure
         step = np.repeat(np.arange(len(above.counts)), above.counts)
         counts = np.bincount(step[sure], minlength=len(above.counts))
-        half = np.column_stack([above.half_axes, np.zeros(len(sure))])[sure].astype(np.float32)
+        half = np.column_stack([above.half_axes, np.zeros(len(sure))])[sure]
         angle = above.angle[sure] / 2
         turn = np.column_stack([np.zeros((len(angle), 2)), np.sin(angle), np.cos(angle)])
-        columns = rr.Ellipsoids3D.columns(
-            half_sizes=half, centers=flat(above.points[sure], "corrected"), quaternions=turn,
+        ellipses = columns(
+            rr.Ellipsoids3D, counts, half_sizes=half, centers=flat(above.points[sure], "corrected"), quaternions=turn,
             colors=above.colours[sure],
         )  # fmt: skip
-        self.send(entity, table, columns.partition(counts))
+        self.send(entity, table, ellipses)
 
     def _plots(self, table: traces.Columns, reference: Floats) -> None:
         for name, values in ranges.plotted(table, reference, self._slots).items():
-            n, slots, series = values.shape
-            counts = np.full(n, series)
-            for k in range(slots):
-                columns = rr.Scalars.columns(scalars=np.ascontiguousarray(values[:, k]).ravel()).partition(counts)
-                self.send(f"landmark/{k + 1}/{name}", table, columns)
+            for k in range(values.shape[1]):
+                self.send(f"landmark/{k + 1}/{name}", table, columns(rr.Scalars, scalars=values[:, k]))
         if np.isfinite(reference).any():
-            counts = np.full(len(reference), reference.shape[1])
-            self.send("reference", table, rr.Scalars.columns(scalars=reference.ravel()).partition(counts))
-        ends = np.unique([0, len(reference) - 1])
-        there = {"frame": table["frame"][ends], "t_ns": table["t_ns"][ends]}
-        bounds = rr.Scalars.columns(scalars=np.tile(CHI2, len(ends))).partition(np.full(len(ends), len(CHI2)))
-        self.send("bounds/nis", there, bounds)
+            self.send("reference", table, columns(rr.Scalars, scalars=reference))
+        self.send("bounds/nis", table, columns(rr.Scalars, scalars=np.tile(CHI2, (len(reference), 1))))
 
     # ---- the end
 
@@ -221,7 +215,7 @@ class RangeDrawing(Drawing):
         root = f"{self.root}/smoothed/{slot + 1}"
         values = {"state": mean, "covariance": covariance.reshape(-1, 9), "range": ranges.smoothed(mean, covariance)}
         for name, rows in values.items():
-            self.file.send(f"{root}/{name}", frames, t_ns, rr.Scalars.columns(scalars=np.ascontiguousarray(rows)))
+            self.file.send(f"{root}/{name}", frames, t_ns, columns(rr.Scalars, scalars=rows))
         plot = ranges.SMOOTHED
         widths = [1.0 if thin else 2.0 for thin in plot.thin]
         look = rr.SeriesLines(names=plot.series, colors=np.array(plot.colours, np.uint32), widths=widths)
@@ -245,7 +239,7 @@ class RangeDrawing(Drawing):
         self.file.static(f"{self.world}/camera/path", line)
         self.file.scale_bar(extent)
         vectors = flat(ARROW_SHARE * extent.size_m * ahead)
-        arrows = rr.Arrows3D.columns(vectors=vectors, origins=flat(way, "arrows"))
+        arrows = columns(rr.Arrows3D, vectors=vectors, origins=flat(way, "arrows"))
         self.file.send(f"{self.world}/camera/heading", frames[good], t_ns[good], arrows)
         self.file.static(f"{self.root}/slots", document(self._slot_table()))
         return {"extent": extent, "landmarks": self._landmarks(), "smoothed": frozenset(self._smoothed)}

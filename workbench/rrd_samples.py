@@ -35,7 +35,8 @@ from readers.streams import (
     StreamKind,
     TrackSample,
 )
-from workbench.rrd_file import RrdFile, blobs
+from workbench.rrd_columns import columns, own_columns
+from workbench.rrd_file import RrdFile
 from workbench.rrd_file import numbers as plain
 
 ROOT = "/sensors/streams"
@@ -141,9 +142,10 @@ class SampleLog:
         for (stream, kind), group in _grouped(rows, lambda row: (row.sample.stream, type(row.sample).__name__)):
             self._send(entity_of(stream), FORMS[kind], group)
         for stream, images in _grouped(greys, lambda grey: grey[0].stream):
-            columns = rr.DynamicArchetype.columns(ARCHETYPE, components={"grey": blobs([data for _, data in images])})
+            pixels = np.frombuffer(b"".join(data for _, data in images), np.uint8)
+            stored = own_columns(ARCHETYPE, {"grey": pixels}, [len(data) for _, data in images])
             frames, t_ns = (np.array([getattr(s, name) for s, _ in images], np.int64) for name in ("frame", "t_ns"))
-            self._file.send(entity_of(stream, GREY), frames, t_ns, columns)
+            self._file.send(entity_of(stream, GREY), frames, t_ns, stored)
 
     def _send(self, entity: str, form: Form, rows: Sequence[Stored]) -> None:
         samples = [row.sample for row in rows]
@@ -157,25 +159,23 @@ class SampleLog:
         }
         if hasattr(samples[0], "ids"):
             lists["ids"] = [s.ids for s in samples]  # type: ignore[attr-defined]
-        columns: list[Any] = []
+        sent: list[rr.ComponentColumn] = []
         if form.numbers and form.plotted:
             self._legend(entity, form)
-            table = _table(form, samples)
-            columns += rr.Scalars.columns(scalars=table.ravel()).partition([table.shape[1]] * len(table))
+            sent += columns(rr.Scalars, scalars=_table(form, samples))
         elif form.numbers:
             lists["values"] = [_numbers(form, sample) for sample in samples]
-        columns += rr.DynamicArchetype.columns(ARCHETYPE, components=components)
+        sent += own_columns(ARCHETYPE, components)
         for name, values in lists.items():
             flat: Any = list(itertools.chain(*values)) if name == "texts" else np.concatenate(values)
             if not len(flat):
                 continue
-            column = rr.DynamicArchetype.columns(ARCHETYPE, components={name: flat})
-            columns += column.partition([len(v) for v in values])
+            sent += own_columns(ARCHETYPE, {name: flat}, [len(v) for v in values])
         # not on the timeline of frames: its numbers are those of the frames of one stream
         t_ns = np.array([sample.t_ns for sample in samples], np.int64)
         frames = np.array([getattr(sample, "frame", -1) for sample in samples], np.int64)
         on_frames = bool((frames >= 0).all())
-        self._file.send(entity, frames if on_frames else None, t_ns, columns)
+        self._file.send(entity, frames if on_frames else None, t_ns, sent)
         self._lags(samples, frames if on_frames else None, t_ns)
 
     def _lags(self, samples: Sequence[Sample], frames: NDArray[np.int64] | None, t_ns: NDArray[np.int64]) -> None:
@@ -186,8 +186,8 @@ class SampleLog:
         if lags_ms and entity not in self._named:
             self._named.add(entity)
             self._file.static(entity, rr.SeriesLines(names=[f"{samples[0].stream}: log time - stamp, ms"]))
-        columns = rr.Scalars.columns(scalars=lags_ms)
-        self._file.send(entity, None if frames is None else frames[stamped], t_ns[stamped], columns)
+        lags = columns(rr.Scalars, scalars=lags_ms)
+        self._file.send(entity, None if frames is None else frames[stamped], t_ns[stamped], lags)
 
     def _legend(self, entity: str, form: Form) -> None:
         if entity not in self._named:

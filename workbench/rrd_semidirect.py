@@ -13,8 +13,9 @@ from pipelines.semidirect.step import Stage
 from workbench import traces
 from workbench import visual_traces as visual
 from workbench.blueprints import Extent
+from workbench.rrd_columns import columns, repeated
 from workbench.rrd_drawing import Drawing
-from workbench.rrd_file import ARROW_SHARE, COLOURS, Floats, Ints, RrdFile, arrow, document, flat, marker, repeated
+from workbench.rrd_file import ARROW_SHARE, COLOURS, Floats, Ints, RrdFile, arrow, document, flat, marker
 from workbench.schema import Schema
 from workbench.traces import Joined
 
@@ -104,14 +105,14 @@ class VisualDrawing(Drawing):
         spread = np.column_stack([visual.quantiles(errors, 0.5), visual.quantiles(errors, 0.9)])
         self._series("features/error", table, spread)
         texts = self._texts(table)
-        media = repeated(rr.TextDocument.columns(media_type=["text/markdown"]), len(texts))
-        self.send("numbers", table, rr.TextDocument.columns(text=texts), media)
+        media = repeated(rr.TextDocument, len(texts), media_type="text/markdown")
+        self.send("numbers", table, columns(rr.TextDocument, text=texts), media)
 
     def _series(self, entity: str, table: traces.Columns, values: Floats) -> None:
         """Log rows of numbers [n, k] for a plot, and whether there ever was one."""
         told = bool(np.nan_to_num(values).any())
         self.silent = self.silent - {entity} if told else self.silent
-        self.send(entity, table, _scalars(values))
+        self.send(entity, table, columns(rr.Scalars, scalars=values))
 
     def _texts(self, table: traces.Columns) -> list[str]:
         return visual.numbers(table, semidirect=False)
@@ -132,8 +133,8 @@ class VisualDrawing(Drawing):
     def _points(self, name: str, table: traces.Columns, points: Joined, chosen: Any, **more: Any) -> None:
         """Draw some points on the image."""
         some = points.chosen(chosen)
-        columns = rr.Points2D.columns(positions=some.values + 0.5, **more)
-        self.send(f"{self.image}/{name}", table, columns.partition(some.counts))
+        drawn = columns(rr.Points2D, some.counts, positions=some.values + 0.5, **more)
+        self.send(f"{self.image}/{name}", table, drawn)
 
     def _structure(self, table: traces.Columns) -> None:
         """The map where it changed; in between the last one stays."""
@@ -145,8 +146,8 @@ class VisualDrawing(Drawing):
             points = Joined.of(table["map_point_m"][changed])
             sigma = np.concatenate(table["map_point_sigma_m"][changed])
             colours = visual.heat(visual.sureness(sigma, depth[changed][points.rows]))
-            columns = rr.Points3D.columns(positions=points.values.astype(np.float32), colors=colours)
-            self.send(f"{self.world}/map/points", at, columns.partition(points.counts))
+            drawn = columns(rr.Points3D, points.counts, positions=points.values, colors=colours)
+            self.send(f"{self.world}/map/points", at, drawn)
             self._uncertain(at, points, sigma)
             if "map_point_covariance" in table:
                 self._ellipsoids(at, points, np.concatenate(table["map_point_covariance"][changed]))
@@ -158,8 +159,8 @@ class VisualDrawing(Drawing):
         """The points as balls of radius σ, where that is known."""
         known = np.isfinite(sigma)
         some = points.chosen(known)
-        columns = rr.Points3D.columns(positions=some.values.astype(np.float32), radii=sigma[known].astype(np.float32))
-        self.send(f"{self.world}/map/sigma", at, columns.partition(some.counts))
+        balls = columns(rr.Points3D, some.counts, positions=some.values, radii=sigma[known])
+        self.send(f"{self.world}/map/sigma", at, balls)
 
     def _ellipsoids(self, at: traces.Columns, points: Joined, covariance: Floats) -> None:
         """The points as ellipsoids of one standard deviation, where their covariance is known."""
@@ -167,12 +168,14 @@ class VisualDrawing(Drawing):
         some = points.chosen(known)
         variance, axes = np.linalg.eigh(covariance[known])
         axes[:, :, 2] *= np.sign(np.linalg.det(axes))[:, None]  # right-handed
-        columns = rr.Ellipsoids3D.columns(
-            centers=some.values.astype(np.float32),
-            half_sizes=np.sqrt(np.maximum(variance, 0.0)).astype(np.float32),
-            quaternions=Rotation.from_matrix(axes).as_quat().astype(np.float32) if len(axes) else np.zeros((0, 4)),
+        ellipsoids = columns(
+            rr.Ellipsoids3D,
+            some.counts,
+            centers=some.values,
+            half_sizes=np.sqrt(np.maximum(variance, 0.0)),
+            quaternions=Rotation.from_matrix(axes).as_quat() if len(axes) else np.zeros((0, 4)),
         )
-        self.send(f"{self.world}/map/covariance", at, columns.partition(some.counts))
+        self.send(f"{self.world}/map/covariance", at, ellipsoids)
 
     def _keyframes(self, table: traces.Columns, framed: Any) -> None:
         at = {"frame": table["frame"][framed], "t_ns": table["t_ns"][framed]}
@@ -180,22 +183,20 @@ class VisualDrawing(Drawing):
         turns = np.concatenate(table["keyframe_quat_xyzw"][framed])
         depth = np.nan_to_num(table["scene_depth_m"][framed], nan=1.0)[places.rows] * visual.FRUSTUM_DEPTH
         strips = visual.frusta(places.values, turns, self.scene.focal_px, self._size, depth)
-        columns = rr.LineStrips3D.columns(strips=strips.astype(np.float32))
-        self.send(f"{self.world}/map/keyframes", at, columns.partition(places.counts))
+        self.send(f"{self.world}/map/keyframes", at, columns(rr.LineStrips3D, places.counts, strips=strips))
 
     def _way(self, table: traces.Columns) -> None:
         good = table["accepted"].astype(bool) & traces.finite(table["position_m"], 1)
         there = {"frame": table["frame"][good], "t_ns": table["t_ns"][good]}
         position, turn = table["position_m"][good], table["quat_xyzw"][good]
         colours = traces.verdict_colours(table["verdict"][good], COLOURS["corrected"])
-        moved = rr.Transform3D.columns(translation=position, quaternion=turn)
+        moved = columns(rr.Transform3D, translation=position, quaternion=turn)
         self.send(f"{self.world}/camera", there, moved)
-        places = position.astype(np.float32)
-        self.send(f"{self.world}/corrected", there, rr.Points3D.columns(positions=places, colors=colours))
+        self.send(f"{self.world}/corrected", there, columns(rr.Points3D, positions=position, colors=colours))
         above = f"{self.world}/above"
         ground, on_top = (flat(position[:, :2], layer) for layer in ("corrected", "markers"))
-        self.send(f"{above}/path", there, rr.Points3D.columns(positions=ground, colors=colours))
-        self.send(f"{above}/body", there, rr.Points3D.columns(positions=on_top))
+        self.send(f"{above}/path", there, columns(rr.Points3D, positions=ground, colors=colours))
+        self.send(f"{above}/body", there, columns(rr.Points3D, positions=on_top))
         self._path.append((there["frame"], there["t_ns"], position, table["pose"][good], table["map_number"][good]))
 
     def _stages(self, table: traces.Columns) -> None:
@@ -204,7 +205,7 @@ class VisualDrawing(Drawing):
         if changes:
             rows = [row for row, _ in changes]
             at = {"frame": table["frame"][rows], "t_ns": table["t_ns"][rows]}
-            self.send("stage", at, rr.StateChange.columns(state=[name for _, name in changes]))
+            self.send("stage", at, columns(rr.StateChange, state=[name for _, name in changes]))
 
     # ---- the end
 
@@ -221,7 +222,7 @@ class VisualDrawing(Drawing):
         extent = Extent.of(np.concatenate([position[:, :2], *([] if given is None else [given.corners])]))
         self.file.scale_bar(extent)
         vectors = ARROW_SHARE * extent.size_m * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
-        arrows = rr.Arrows3D.columns(vectors=flat(vectors), origins=flat(position[:, :2], "arrows"))
+        arrows = columns(rr.Arrows3D, vectors=flat(vectors), origins=flat(position[:, :2], "arrows"))
         self.file.send(f"{self.world}/above/heading", frames, t_ns, arrows)
         depths = np.concatenate(self._depths)
         depth = float(np.median(depths)) if len(depths) else 1.0
@@ -316,9 +317,9 @@ class SemidirectDrawing(VisualDrawing):
         colours = np.array(visual.FILTER_COLOURS, np.uint32)[np.clip(outcome, 0, len(visual.FILTER_COLOURS) - 1)]
         good = traces.finite(ends.values, 1) & (outcome != visual.UNSEEN)
         some = ends.chosen(good)
-        strips = (some.values.reshape(-1, 2, 2) + 0.5).astype(np.float32)
-        columns = rr.LineStrips2D.columns(strips=strips, colors=colours[good])
-        self.send(f"{self.image}/epipolar", table, columns.partition(some.counts))
+        segments = some.values.reshape(-1, 2, 2) + 0.5
+        drawn = columns(rr.LineStrips2D, some.counts, strips=segments, colors=colours[good])
+        self.send(f"{self.image}/epipolar", table, drawn)
         places = Joined.of(table["filter_found_px"])
         good = traces.finite(places.values, 1)
         self._points("filters", table, places, good, colors=colours[good])
@@ -344,12 +345,6 @@ class SemidirectDrawing(VisualDrawing):
             self._course(entity, there, np.full(len(one.frame), float(one.number)), one.values)
 
     def _course(self, entity: str, there: traces.Columns, numbers: Floats, values: Floats) -> None:
-        self.send(f"{entity}/depth", there, _scalars(values[:, :3]))
-        self.send(f"{entity}/ratio", there, _scalars(values[:, 3:]))
-        self.send(f"{entity}/number", there, _scalars(numbers[:, None]))
-
-
-def _scalars(values: Floats) -> rr.ComponentColumnList:
-    """Rows of numbers [n, k]."""
-    flat_values = np.ascontiguousarray(values, np.float64).ravel()
-    return rr.Scalars.columns(scalars=flat_values).partition(np.full(len(values), values.shape[1]))
+        self.send(f"{entity}/depth", there, columns(rr.Scalars, scalars=values[:, :3]))
+        self.send(f"{entity}/ratio", there, columns(rr.Scalars, scalars=values[:, 3:]))
+        self.send(f"{entity}/number", there, columns(rr.Scalars, scalars=numbers[:, None]))

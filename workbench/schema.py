@@ -90,12 +90,20 @@ class Schema:
         """The declared type of each field."""
         return get_type_hints(self.step_type)
 
-    def of(self, archetype: Archetype) -> dict[str, tuple[Row, ...]]:
+    def of(self, archetype: Archetype) -> Mapping[str, tuple[Row, ...]]:
         """The rows of one archetype by entity, in order."""
-        groups: dict[str, tuple[Row, ...]] = {}
+        return self._groups.get(archetype, {})
+
+    @functools.cached_property
+    def _declared(self) -> Mapping[str, Mapping[str, Any]]:
+        return quantities(self.step_type)
+
+    @functools.cached_property
+    def _groups(self) -> dict[Archetype, dict[str, tuple[Row, ...]]]:
+        groups: dict[Archetype, dict[str, tuple[Row, ...]]] = {}
         for row in self.rows:
-            if row.archetype is archetype:
-                groups[row.entity] = (*groups.get(row.entity, ()), row)
+            entities = groups.setdefault(row.archetype, {})
+            entities[row.entity] = (*entities.get(row.entity, ()), row)
         return groups
 
     def entity(self, field: str) -> str:
@@ -138,13 +146,13 @@ class Schema:
 
     def shape(self, field: str) -> tuple[int | str, ...]:
         """The declared shape of a field; a letter stands for a length that the settings decide."""
-        return tuple(quantities(self.step_type)[field]["shape"])
+        return tuple(self._declared[field]["shape"])
 
     def series(self, entity: str, width: int) -> list[Series]:
         """The series of a scalar entity whose rows hold `width` numbers."""
         found: list[Series] = []
         for row in self.of(Archetype.SCALARS)[entity]:
-            quantity = quantities(self.step_type)[row.field]
+            quantity = self._declared[row.field]
             fixed = math.prod(n for n in quantity["shape"] if isinstance(n, int))
             free = [n for n in quantity["shape"] if isinstance(n, str)]
             axes = row.axes or tuple(map(str, range(fixed))) if fixed > 1 else ("",)
@@ -157,6 +165,7 @@ class Schema:
         return found
 
 
+@functools.cache
 def _colour(place: int, axis: int, axes: int) -> int:
     """RGBA of a series: shades of blue and orange for the two axes of a plane, else a hue of its own."""
     hue = (0.57, 0.08)[axis] if axes == 2 else 0.57 + place * 0.618

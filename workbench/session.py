@@ -535,7 +535,7 @@ class _PathAccount:
         if pose is not None:
             self._frames.append(step.frame)
             self._t_ns.append(step.t_ns)
-            self._poses.extend(float(v) for v in pose)
+            self._poses.extend(np.asarray(pose, np.float64).tolist())
 
     def conclude(self, run: RunLog, tally: Tally, median_dt_s: float) -> tuple[dict[str, Any], Floats | None]:
         """Hold the path against the reference and log its errors."""
@@ -962,6 +962,7 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version(), **{name: _version(name) for name in PACKAGES}}
 
 
+@functools.cache
 def _version(package: str) -> str:
     try:
         return importlib.metadata.version(package)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 from collections import Counter
 from collections.abc import Mapping
@@ -92,10 +93,10 @@ class Tally:
         """Take note of one step."""
         self.frames += 1
         self.used += accepted
-        if accepted and _grave(alarms, Severity.ERROR):
-            self.failed += 1
-        elif accepted and _grave(alarms & ~CIRCUMSTANCES, Severity.WARNING):
-            self.doubtful += 1
+        if accepted:
+            failed, doubtful = _worth(alarms)
+            self.failed += failed
+            self.doubtful += doubtful
         self.verdicts[verdict] += 1
         for flag in flags(alarms):
             self.alarms[flag] += 1
@@ -253,9 +254,11 @@ def _upshot(tally: Tally, doubts: bool) -> str:
     )
 
 
-def _grave(alarms: Verdict, severity: Severity) -> bool:
-    """Whether one of the alarms is at least so grave."""
-    return gravest(alarms).severity >= severity
+@functools.cache
+def _worth(alarms: Verdict) -> tuple[bool, bool]:
+    """Whether a motion that was measured under these alarms failed, and whether it is only doubtful."""
+    failed = gravest(alarms).severity >= Severity.ERROR
+    return failed, not failed and gravest(alarms & ~CIRCUMSTANCES).severity >= Severity.WARNING
 
 
 def percent(share: float) -> str:

@@ -95,7 +95,7 @@ def shape_of(schema: Schema) -> Any:
         for row in schema.rows
         if row.archetype is not Archetype.LISTS and any(isinstance(n, str) for n in schema.shape(row.field))
     ]
-    return lambda step: tuple(getattr(step, name).shape for name in free)
+    return operator.attrgetter(*(f"{name}.shape" for name in free)) if free else lambda step: ()
 
 
 def scalar_groups(schema: Schema, table: Columns) -> Iterator[tuple[str, Floats]]:

@@ -39,7 +39,7 @@ def tum_line(t_ns: int, position_m: Sequence[float] | Floats, quat_xyzw: Sequenc
 def tum_line_in_plane(t_ns: int, pose: Sequence[float]) -> str:
     """One line of a TUM file of a pose x, y (m), heading (rad)."""
     x, y, heading = map(float, pose)
-    return tum_line(t_ns, (x, y, 0.0), (0.0, 0.0, math.sin(heading / 2), math.cos(heading / 2)))
+    return f"{seconds_text(t_ns)} {x!r} {y!r} 0.0 0.0 0.0 {math.sin(heading / 2)!r} {math.cos(heading / 2)!r}\n"
 
 
 def kitti_line(pose: Floats) -> str:

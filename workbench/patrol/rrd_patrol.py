@@ -18,6 +18,7 @@ from workbench.blueprints import Extent, ground_view
 from workbench.patrol.areas import rings_of
 from workbench.patrol.colours import Scale
 from workbench.patrol.evaluating import Evaluation
+from workbench.rrd_columns import columns
 from workbench.rrd_file import RrdFile, document
 
 Floats = NDArray[np.float64]
@@ -146,7 +147,7 @@ def _flown(file: RrdFile, done: Evaluation, extent: Extent) -> None:
     _outlines(file, "/world/flown", [done.track.position_m[:, :2]], "flown", HEIGHTS["flown"], extent)
     found = done.found
     strips = [_layer(np.concatenate([o, o[:1]]), HEIGHTS["footprint"], extent) for o in found.footprints]
-    looks = rr.LineStrips3D.columns(strips=strips)
+    looks = columns(rr.LineStrips3D, strips=strips)
     file.static(
         "/world/footprint", rr.LineStrips3D.from_fields(colors=COLOURS["footprint"], radii=rr.Radius.ui_points(1))
     )
@@ -162,10 +163,10 @@ def _curves(file: RrdFile, done: Evaluation) -> list[rrb.TimeSeriesView]:
         curves["overlap"] = ("Overlap with the picture before", at, t_ns[at], done.overlaps[known])
     plots = []
     for name, (title, numbers, times, values) in curves.items():
-        file.send(f"/patrol/{name}", numbers, times, rr.Scalars.columns(scalars=values))
+        file.send(f"/patrol/{name}", numbers, times, columns(rr.Scalars, scalars=values))
         plots.append(rrb.TimeSeriesView(origin=f"/patrol/{name}", name=title))
     if done.beside is not None:
-        cross = rr.Scalars.columns(scalars=done.beside.cross_m)
+        cross = columns(rr.Scalars, scalars=done.beside.cross_m)
         file.send("/patrol/cross_track", None, done.track.t_ns, cross)
         plots.append(rrb.TimeSeriesView(origin="/patrol/cross_track", name="Beside the plan, m (left positive)"))
     return plots
