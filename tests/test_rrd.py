@@ -522,7 +522,7 @@ RUNS: dict[type[Step], tuple[Callable[[int], Iterable[Step]], set[str]]] = {
     CorrelationStep: (fake_steps.steps, {"Correlation surfaces", "Second / first"}),
     RangeStep: (fake_ranges.steps, {"Ranges Z, m", "Ranges: 0.5 m red to 50 m blue"}),
     BaselineStep: (fake_semidirect.baseline_steps, {"Corners of the frame", "Map: path blue, reference green"}),
-    SemidirectStep: (fake_semidirect.steps, {"Alignment cost, grey²", "Filters by outcome"}),
+    SemidirectStep: (fake_semidirect.steps, {"Cost, grey²", "By outcome"}),
 }
 
 
