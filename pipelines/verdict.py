@@ -76,6 +76,7 @@ class Verdict(enum.IntFlag):
     RELOCALISED = 1 << 47
     AFTER_RELOCALISATION = 1 << 48
     NEW_MAP = 1 << 49
+    POINTS_UNLIKE = 1 << 50
 
     @property
     def sentence(self) -> str:
@@ -140,6 +141,7 @@ _SENTENCES: dict[Verdict, str] = {
     Verdict.RELOCALISED: "found again by a keyframe of the map",
     Verdict.AFTER_RELOCALISATION: "the path was lost before: how it continues the path up to there is not sure",
     Verdict.NEW_MAP: "a new map was begun: its place and scale do not continue the path before",
+    Verdict.POINTS_UNLIKE: "the map points neither agree well nor look like their patches: this is another place",
 }
 
 _SEVERITIES: dict[Verdict, Severity] = {

@@ -128,6 +128,7 @@ def _step(rng: np.random.Generator, frame: int, points: NDArray[np.float64], sca
         "aligned_position_m": place,
         "point_state": rng.integers(0, 3, m),
         "residual_rms": rng.gamma(2, 3, m),
+        "correlation": rng.uniform(0.8, 1, m),
         "iterations": rng.integers(1, 10, m),
         "outcome_count": np.bincount(outcome, minlength=len(Feature)).astype(np.int64),
         "pose_cost": rng.uniform(0, 5, REFINED),

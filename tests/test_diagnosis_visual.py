@@ -9,8 +9,11 @@ import numpy as np
 import pytest
 
 from pipelines.evaluation import Trajectory
+from pipelines.replay import replay
+from pipelines.semidirect.odometry import SemidirectOdometry
 from pipelines.semidirect.settings import SemidirectSettings
 from pipelines.semidirect.step import SemidirectStep
+from pipelines.simulation.mission import HEIGHT, IMAGE
 from pipelines.simulation.scenario import build
 from pipelines.verdict import Verdict
 from workbench.diagnosis import diagnose, rules_of
@@ -166,3 +169,17 @@ def test_what_a_fault_leads_to_counts_neither_way() -> None:
         "after-relocalisation"
         not in score(dataclasses.replace(planted, also=frozenset({"after-relocalisation"})), 0).here
     )
+
+
+def test_a_leap_over_weak_texture_is_lost_by_the_looks_of_the_points() -> None:
+    """On concrete half of the points settle on something near and agree by chance."""
+    leap = {"kind": "turn-jump", "start_s": 0.705, "stop_s": 1.0, "turn_rad": -0.93}
+    mission = build(scenario(23, {"faults": [leap], "frames": 60}))
+    usual = settings_for(mission, "fast", {"settings": {"min_tracked": 10, "max_drop": 0.95}})
+    for most_px, lost in ((usual.unlike_px, True), (1e3, False)):
+        estimator = SemidirectOdometry(usual.model_copy(update={"unlike_px": most_px}))
+        steps = [one.step for one in replay(mission, estimator, image_stream=IMAGE, other_streams=[HEIGHT])]
+        hit = next(k for k, step in enumerate(steps) if step.t_ns - steps[0].t_ns >= 705_000_000)
+        assert steps[hit - 1].accepted
+        assert (Verdict.POINTS_UNLIKE in steps[hit].alarms) == lost
+        assert any(step.accepted for step in steps[hit : hit + 10]) == (not lost)

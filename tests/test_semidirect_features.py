@@ -154,6 +154,7 @@ def test_the_fixed_point_has_no_gradient_in_noise() -> None:
     r = np.array(place) - inner - found.mean_difference
     assert np.max(np.abs((j * r).sum((1, 2)))) < 1e-5
     assert found.residual_rms == pytest.approx(np.sqrt(np.mean(r**2)), rel=1e-9)
+    assert found.correlation == pytest.approx(np.corrcoef(np.ravel(place), inner.ravel())[0, 1], rel=1e-6)
 
 
 def test_failures_of_a_patch_have_their_causes() -> None:

@@ -410,6 +410,7 @@ SEMIDIRECT = Schema(
         Row("aligned_position_m", "alignment/position", axes=_XYZ, title="aligned"),
         Row("point_state", "features/points", _LIST, also="shade of the points on the image"),
         Row("residual_rms", "features/points", _LIST),
+        Row("correlation", "features/points", _LIST),
         Row("iterations", "features/points", _LIST),
         Row("outcome_count", "features/count", axes=_names(Feature), title="points"),
         Row("pose_cost", "refinement/cost", _LIST, also=_TABLE),

@@ -68,6 +68,8 @@ ADVICE: Mapping[Verdict, str] = {
     Verdict.RELOCALISED: "found again by a keyframe that looked alike; on a surface that repeats itself that can be "
     "another place",
     Verdict.NEW_MAP: "a new map was begun after a loss: mend the cause of the loss",
+    Verdict.POINTS_UNLIKE: "the view leaps to where the map's points are not: missing frames, a cut, or something "
+    "that covers the view",
 }
 
 CIRCUMSTANCES = Verdict.DUPLICATE_FRAME | Verdict.FRAME_GAP | Verdict.HEIGHT_CHANGE | Verdict.EXPOSURE_JUMP

@@ -264,11 +264,17 @@ def _semidirect_numbers(table: Columns, row: int) -> list[str]:
     return [
         head + "".join(line % level for level in aligned),
         f"Pose: {_course(table['pose_cost'][row])} px² in {int(table['pose_iterations'][row])} iterations; error "
-        f"{table['error_before_px'][row]:.3g} → {table['error_after_px'][row]:.3g} px",
+        f"{table['error_before_px'][row]:.3g} → {table['error_after_px'][row]:.3g} px; median correlation of points "
+        f"and patches {_median(table['correlation'][row])}",
         f"Bundle: {_course(table['bundle_cost'][row])} px², {int(table['bundle_keyframes'][row])} keyframes, "
         f"{int(table['bundle_points'][row])} points, {int(table['bundle_outliers'][row])} outliers",
         f"Filters: {int(table['filters'][row])}; height {heights}",
     ]
+
+
+def _median(values: Floats) -> str:
+    known = values[np.isfinite(values)]
+    return f"{np.median(known):.3g}" if len(known) else "–"
 
 
 def _course(costs: Floats) -> str:

@@ -255,12 +255,16 @@ class FeatureOptions(NamedTuple):
 
 
 class Found(NamedTuple):
-    """A patch's place on the current level: `u`, `v`, mean difference (grey levels), residual rms, iterations."""
+    """A patch's place on the current level: `u`, `v`, mean difference (grey levels), residual rms, iterations.
+
+    `correlation` is that of the patch with the image there, from -1 to 1.
+    """
 
     u: float
     v: float
     mean_difference: float
     residual_rms: float
+    correlation: float
     iterations: int
     outcome: int
 
@@ -270,7 +274,8 @@ class Features(NamedTuple):
 
     `pixels` [n, 2]; `predicted` [n, 2] the projections that they started from; `level` [n] the level searched, -1 if
     none; `outcome` [n] a `Feature` each; `mean_difference` [n] and `residual_rms` [n] in grey levels;
-    `iterations` [n]; `affine` [n, 2, 2] from the reference's to the current level 0.
+    `correlation` [n] of the patch with the image where it was found; `iterations` [n]; `affine` [n, 2, 2] from the
+    reference's to the current level 0.
     """
 
     pixels: Floats
@@ -279,6 +284,7 @@ class Features(NamedTuple):
     outcome: Longs
     mean_difference: Floats
     residual_rms: Floats
+    correlation: Floats
     iterations: Longs
     affine: Floats
 
@@ -304,10 +310,12 @@ def align_patch(image: Grey, patch: Floats, u: float, v: float, options: Feature
     """Lay the inner 8 x 8 of a patch [10, 10] over the image, from (u, v) on.
 
     J = (T_u, T_v, 1) with the patch's central differences and H = Σ J Jᵀ, once; r = I(u, v) - T + m,
-    (δu, δv, δm) = -H⁻¹ Σ J r. Converged when δu² + δv² < tolerance².
+    (δu, δv, δm) = -H⁻¹ Σ J r. Converged when δu² + δv² < tolerance². The correlation is that of the two 8 x 8, by
+    Σ r² less the mean = S_T + S_I - 2 S_TI, S their sums of squares about the means.
     """
     rows, columns = image.shape
     h, slope = np.zeros((3, 3)), np.empty((AREA, 2))
+    sum_t, sum_tt = 0.0, 0.0
     for k in range(AREA):
         y, x = k // SIDE + 1, k % SIDE + 1
         slope[k, 0] = (patch[y, x + 1] - patch[y, x - 1]) / 2
@@ -317,18 +325,20 @@ def align_patch(image: Grey, patch: Floats, u: float, v: float, options: Feature
         h[1, 1] += slope[k, 1] ** 2
         h[2, 0] += slope[k, 0]
         h[2, 1] += slope[k, 1]
+        sum_t += patch[y, x]
+        sum_tt += patch[y, x] ** 2
     h[2, 2] = AREA
     nan = math.nan
     if not linear.factor(h, 3):
-        return Found(nan, nan, nan, nan, 0, _FLAT)
+        return Found(nan, nan, nan, nan, nan, 0, _FLAT)
     mean, step = 0.0, np.empty(3)
     for i in range(options.iterations):
         if not (REACH <= u < columns - 1 - REACH and REACH <= v < rows - 1 - REACH):
-            return Found(nan, nan, nan, nan, i, _LEFT_IMAGE)
+            return Found(nan, nan, nan, nan, nan, i, _LEFT_IMAGE)
         column, row = int(u - REACH), int(v - REACH)
         f, g = u - REACH - column, v - REACH - row
         w00, w01, w10, w11 = (1 - f) * (1 - g), f * (1 - g), (1 - f) * g, f * g
-        by_u, by_v, by_mean, square = 0.0, 0.0, 0.0, 0.0
+        by_u, by_v, by_mean, square, sum_gg = 0.0, 0.0, 0.0, 0.0, 0.0
         for y in range(SIDE):
             above, below, template = image[row + y], image[row + y + 1], patch[y + 1]
             for x in range(SIDE):
@@ -339,14 +349,19 @@ def align_patch(image: Grey, patch: Floats, u: float, v: float, options: Feature
                 by_v += slope[y * SIDE + x, 1] * r
                 by_mean += r
                 square += r * r
+                sum_gg += grey * grey
         step[0], step[1], step[2] = -by_u, -by_v, -by_mean
         linear.substitute(h, step, 3)
         u, v, mean = u + step[0], v + step[1], mean + step[2]
         if step[0] ** 2 + step[1] ** 2 < options.tolerance_px**2:
+            sum_g = by_mean + sum_t - AREA * (mean - step[2])
+            s_t, s_g = sum_tt - sum_t**2 / AREA, sum_gg - sum_g**2 / AREA
+            unlike = square - by_mean**2 / AREA
+            correlation = (s_t + s_g - unlike) / (2 * math.sqrt(s_t * s_g)) if s_t > 0 and s_g > 0 else 0.0
             # what the last step takes away from the squares: gᵀ H⁻¹ g
             square += by_u * step[0] + by_v * step[1] + by_mean * step[2]
-            return Found(u, v, -mean, math.sqrt(max(square, 0.0) / AREA), i + 1, _MATCHED)
-    return Found(u, v, -mean, nan, options.iterations, _NOT_CONVERGED)
+            return Found(u, v, -mean, math.sqrt(max(square, 0.0) / AREA), correlation, i + 1, _MATCHED)
+    return Found(u, v, -mean, nan, nan, options.iterations, _NOT_CONVERGED)
 
 
 @compiled
@@ -357,6 +372,7 @@ def no_features(n: int) -> Features:
         np.full((n, 2), math.nan),
         np.full(n, -1, np.int64),
         np.full(n, _NOT_TRIED, np.int64),
+        np.full(n, math.nan),
         np.full(n, math.nan),
         np.full(n, math.nan),
         np.zeros(n, np.int64),
@@ -444,4 +460,5 @@ def align_feature(
     result = align_patch(level_image(current, level), patch, u, v, options)
     found.outcome[i], found.iterations[i] = result.outcome, result.iterations
     found.mean_difference[i], found.residual_rms[i] = result.mean_difference, result.residual_rms
+    found.correlation[i] = result.correlation
     found.pixels[i, 0], found.pixels[i, 1] = on_finest(result.u, level), on_finest(result.v, level)

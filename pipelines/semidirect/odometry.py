@@ -412,6 +412,8 @@ class SemidirectOdometry:
             alarms |= Verdict.FEW_POINTS
         elif tracked.points < (1 - s.max_drop) * state.tracked:
             alarms |= Verdict.POINTS_DROPPED
+        if tracked.unlike(s.unlike_px, s.unlike_correlation):
+            alarms |= Verdict.POINTS_UNLIKE
         return alarms
 
     def _accepted(
@@ -657,8 +659,10 @@ def _scaled_pose(cam_t_world: Floats, factor: float, about: Floats) -> Floats:
 
 
 def _convincing(tracked: Tracked, settings: SemidirectSettings) -> bool:
-    """Whether a relocalisation holds: enough points, and most of those that were looked for."""
-    return tracked.points >= settings.min_tracked and 2 * tracked.points >= len(tracked.looked.rows)
+    """Whether a relocalisation holds: enough points, most of those looked for, and what is there looks like them."""
+    s = settings
+    most = tracked.points >= s.min_tracked and 2 * tracked.points >= len(tracked.looked.rows)
+    return most and not tracked.unlike(s.unlike_px, s.unlike_correlation)
 
 
 def _search_fields(found: Relocalised, world: LocalMap) -> dict[str, Any]:

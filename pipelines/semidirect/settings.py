@@ -142,6 +142,10 @@ class SemidirectSettings(CameraSettings):
     max_drop: Fraction = Field(
         0.5, description="losing a larger share of the points from one frame to the next is LOST"
     )
+    unlike_px: Positive = Field(
+        1.0, description="a larger median error of points that do not look like their patches is LOST"
+    )
+    unlike_correlation: Fraction = Field(0.6, description="… which is a smaller median correlation with them")
     relocalise_correlation: Fraction = Field(0.7, description="least correlation of the small images")
     restart_s: NotNegative = Field(2.0, description="a new map is begun when lost for so long, 0: never")
 

@@ -140,6 +140,7 @@ class SemidirectStep(VisualStep):
     # 2. feature alignment
     point_state: Longs = quantity("1", "`PointState` of each point looked for", "M")
     residual_rms: Floats = quantity("grey", "rms of what remains after its alignment", "M")
+    correlation: Floats = quantity("1", "correlation of its patch with the image where it was found", "M")
     iterations: Longs = quantity("1", "iterations of its alignment", "M")
     outcome_count: Longs = quantity("1", "how many points had each `Feature`", 9)
 

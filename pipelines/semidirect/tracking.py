@@ -81,6 +81,19 @@ class Tracked(NamedTuple):
         """How many map points agree with the pose."""
         return len(self.sightings.rows)
 
+    def unlike(self, most_error_px: float, least_correlation: float) -> bool:
+        """Whether the points neither agree well nor look like their patches.
+
+        So it is where the camera is elsewhere: the alignments settle on whatever is near, and half of them agree by
+        chance. Noise and blur cost likeness too, but the points then agree; both are told by medians over all found.
+        """
+        found = np.isfinite(self.error_px)
+        return bool(
+            found.any()
+            and np.median(self.error_px[found]) > most_error_px
+            and np.median(self.looked.features.correlation[found]) < least_correlation
+        )
+
 
 Lap = Callable[[int], None]
 
@@ -273,8 +286,8 @@ def find_points(
         m += 1
     return tried[:m].copy(), Features(
         found.pixels[:m].copy(), found.predicted[:m].copy(), found.level[:m].copy(), found.outcome[:m].copy(),
-        found.mean_difference[:m].copy(), found.residual_rms[:m].copy(), found.iterations[:m].copy(),
-        found.affine[:m].copy(),
+        found.mean_difference[:m].copy(), found.residual_rms[:m].copy(), found.correlation[:m].copy(),
+        found.iterations[:m].copy(), found.affine[:m].copy(),
     )  # fmt: skip
 
 

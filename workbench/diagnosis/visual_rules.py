@@ -148,6 +148,14 @@ def _share(feature: Feature, *more: Feature) -> Callable[[Signals, int, Mapping[
     return is_it
 
 
+_UNLIKE = (Feature.NOT_CONVERGED, Feature.LEFT_IMAGE, Feature.OUTLIER)
+
+
+def _unlike(signals: Signals, row: int, bounds: Mapping[str, float]) -> bool:
+    """Whether the points are not where they were expected, or what is there does not look like them."""
+    return signals.rings(Verdict.POINTS_UNLIKE, row, 0) or _share(*_UNLIKE)(signals, row, bounds)
+
+
 def _share_evidence(feature: Feature, *more: Feature) -> Callable[..., tuple[Evidence, ...]]:
     def evidence(signals: Signals, row: int, bounds: Mapping[str, float]) -> tuple[Evidence, ...]:
         shares = signals.shares[:, [feature, *more]].sum(axis=1)
@@ -224,8 +232,8 @@ CAUSES: tuple[Cause, ...] = (
         "surface that repeats itself, or a pose that is wrong",
         remedy="look at the image there; a shorter exposure, or more keyframes (keyframe_distance lower)",
         thresholds={"share": 0.4},
-        is_it=_share(Feature.NOT_CONVERGED, Feature.LEFT_IMAGE, Feature.OUTLIER),
-        evidence=_share_evidence(Feature.NOT_CONVERGED, Feature.LEFT_IMAGE, Feature.OUTLIER),
+        is_it=_unlike,
+        evidence=_share_evidence(*_UNLIKE),
     ),
     Cause(
         name="lost-drop",

@@ -46,7 +46,7 @@ def scenario(seed: int, values: Values) -> Scenario:
     usual: Values = {
         "name": f"scored {seed}",
         "seed": seed,
-        "frames": FRAMES,
+        "frames": values.get("frames", FRAMES),
         "ground": {"family": FAMILIES[seed % len(FAMILIES)], "size_px": 512, "metres_per_px": 0.0035},
         "camera": {"width_px": WIDTH_PX, "height_px": HEIGHT_PX, "focal_px": FOCAL_PX, "height_m": ABOVE_M,
                    "timing": {"rate_hz": RATE_HZ}},
