@@ -151,22 +151,29 @@ def _between(mission: SimulatedMission, t_ns: Ints, start_s: float, stop_s: floa
 # ------------------------------------------------------------------------------------- table
 
 
-def _fault(kind: str, draw: Callable[[Rng], Values], length_s: tuple[float, float] = (0.25, 0.45)) -> Makes:
-    """One fault from 0.7…1.0 s on, for so and so long, with the parameters that `draw` draws."""
+def fault(
+    kind: str,
+    draw: Callable[[Rng], Values],
+    length_s: tuple[float, float] = (0.25, 0.45),
+    start_s: tuple[float, float] = (0.7, 1.0),
+) -> Makes:
+    """One fault from a time on, for so and so long, both from their ranges, with the parameters that `draw` draws."""
 
     def make(rng: Rng) -> Values:
-        start_s = float(rng.uniform(0.7, 1.0))
-        stop_s = start_s + float(rng.uniform(*length_s))
-        return {"faults": [{"kind": kind, "start_s": start_s, "stop_s": stop_s, **draw(rng)}]}
+        begin_s = float(rng.uniform(*start_s))
+        end_s = begin_s + float(rng.uniform(*length_s))
+        return {"faults": [{"kind": kind, "start_s": begin_s, "stop_s": end_s, **draw(rng)}]}
 
     return make
 
 
-def _in_between(name: str, low: float, high: float, **more: Any) -> Callable[[Rng], Values]:
+def in_between(name: str, low: float, high: float, **more: Any) -> Callable[[Rng], Values]:
+    """A parameter from a range."""
     return lambda rng: {name: float(rng.uniform(low, high)), **more}
 
 
-def _either_way(name: str, low: float, high: float, **more: Any) -> Callable[[Rng], Values]:
+def either_way(name: str, low: float, high: float, **more: Any) -> Callable[[Rng], Values]:
+    """A parameter whose size is from a range, of either sign."""
     return lambda rng: {name: float(rng.uniform(low, high) * rng.choice([-1.0, 1.0])), **more}
 
 
@@ -205,7 +212,7 @@ def _whole(kind: str, name: str, low: float, high: float) -> Makes:
 
 def _section(section: str, name: str, low: float, high: float) -> Makes:
     """No fault, but a value of the mission itself that is off by ± low…high."""
-    draw = _either_way(name, low, high)
+    draw = either_way(name, low, high)
     return lambda rng: {section: draw(rng)}
 
 
@@ -227,27 +234,27 @@ def planted(preset: str = "best") -> tuple[Planted, ...]:
     blink_s = (0.035, 0.1)
     return (
         row(CLEAN, "", _nothing, never, ""),
-        row("repetitive-texture, tiles", "repetitive-texture", _fault("repetitive-texture", _pattern("tiles", (6, 8))),
+        row("repetitive-texture, tiles", "repetitive-texture", fault("repetitive-texture", _pattern("tiles", (6, 8))),
             during, "period 6 or 8 px, within the search"),
         row("repetitive-texture, stripes", "aperture",
-            _fault("repetitive-texture", _pattern("stripes", (8, 12, 16))), during, "period 8, 12 or 16 px"),
-        row("low-texture", "low-texture", _fault("low-texture", _in_between("gradient_rms", 0.2, 0.6, margin_m=0.5)),
+            fault("repetitive-texture", _pattern("stripes", (8, 12, 16))), during, "period 8, 12 or 16 px"),
+        row("low-texture", "low-texture", fault("low-texture", in_between("gradient_rms", 0.2, 0.6, margin_m=0.5)),
             during, "gradient 0.2…0.6 grey/px, noise 2 grey"),
-        row("shift-jump", "shift-beyond-search", _fault("shift-jump", _push), at_the_edges, "12…40 mm (15…51 px)"),
-        row("turn-jump", "rotation-beyond-limit", _fault("turn-jump", _either_way("turn_rad", 0.05, 0.2)),
+        row("shift-jump", "shift-beyond-search", fault("shift-jump", _push), at_the_edges, "12…40 mm (15…51 px)"),
+        row("turn-jump", "rotation-beyond-limit", fault("turn-jump", either_way("turn_rad", 0.05, 0.2)),
             at_the_edges, "±0.05…0.2 rad; limit 0.035"),
-        row("height-change", "height-change", _fault("height-change", _either_way("lift_m", 0.006, 0.03, ramp_s=0.08)),
+        row("height-change", "height-change", fault("height-change", either_way("lift_m", 0.006, 0.03, ramp_s=0.08)),
             during, "±3…15 % of the height"),
-        row("motion-blur", "motion-blur", _not_on_wood(_fault("motion-blur", _in_between("exposure", 0.7, 1.0))),
+        row("motion-blur", "motion-blur", _not_on_wood(fault("motion-blur", in_between("exposure", 0.7, 1.0))),
             during, "0.7…1 of the interval, not on wood"),
-        row("exposure-jump", "exposure-jump", _fault("exposure-jump", _gain), during, "gain 0.5…0.8 or 1.2…1.8"),
-        row("image-noise", "image-noise", _fault("image-noise", _in_between("noise_grey", 8.0, 25.0)), during,
+        row("exposure-jump", "exposure-jump", fault("exposure-jump", _gain), during, "gain 0.5…0.8 or 1.2…1.8"),
+        row("image-noise", "image-noise", fault("image-noise", in_between("noise_grey", 8.0, 25.0)), during,
             "8…25 grey (usual: 2)"),
-        row("lens-dirt", "lens-dirt", _fault("lens-dirt", _in_between("share", 0.35, 0.6)), during, "share 0.35…0.6"),
-        row("dropped-frames", "dropped-frames", _fault("dropped-frames", _nothing, blink_s), behind, "2…6 images"),
-        row("duplicate-frames", "duplicate-frames", _fault("duplicate-frames", _nothing, blink_s), during,
+        row("lens-dirt", "lens-dirt", fault("lens-dirt", in_between("share", 0.35, 0.6)), during, "share 0.35…0.6"),
+        row("dropped-frames", "dropped-frames", fault("dropped-frames", _nothing, blink_s), behind, "2…6 images"),
+        row("duplicate-frames", "duplicate-frames", fault("duplicate-frames", _nothing, blink_s), during,
             "2…6 images"),
-        row("swapped-stamps", "swapped-stamps", _fault("swapped-stamps", _nothing), during, "7…13 pairs"),
+        row("swapped-stamps", "swapped-stamps", fault("swapped-stamps", _nothing), during, "7…13 pairs"),
         row("late-images, from then on", "stamp-jump", _late, at_the_start, "0.03…0.1 s"),
         row("wrong-calibration", "wrong-scale", _whole("wrong-calibration", "focal_factor", 0.03, 0.1), always,
             "focal length ±3…10 %, with a reference"),

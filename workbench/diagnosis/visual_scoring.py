@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Callable, Mapping
 from functools import partial
-from typing import Any
 
 import numpy as np
 
@@ -20,7 +19,20 @@ from pipelines.simulation.mission import HEIGHT, IMAGE, POSE, SimulatedMission
 from pipelines.simulation.scenario import Scenario, build
 from readers.streams import PoseSample
 from workbench.diagnosis.finding import Case
-from workbench.diagnosis.path_scoring import AtFault, Makes, Rng, Values, always, at_the_start, behind, during, never
+from workbench.diagnosis.path_scoring import (
+    AtFault,
+    Makes,
+    Rng,
+    Values,
+    always,
+    at_the_start,
+    behind,
+    during,
+    either_way,
+    fault,
+    in_between,
+    never,
+)
 from workbench.diagnosis.scoring import CLEAN, Planted, Trial
 
 FRAMES, RATE_HZ = 150, 60.0
@@ -94,22 +106,8 @@ def trial(make: Makes, at_fault: AtFault, preset: str, seed: int) -> Trial:
 
 
 def _fault(kind: str, draw: Callable[[Rng], Values], length_s: tuple[float, float] = (0.15, 0.4)) -> Makes:
-    """One fault from 1.2…1.5 s on, when there is a map, for so and so long, with the parameters that `draw` draws."""
-
-    def make(rng: Rng) -> Values:
-        start_s = float(rng.uniform(1.2, 1.5))
-        stop_s = start_s + float(rng.uniform(*length_s))
-        return {"faults": [{"kind": kind, "start_s": start_s, "stop_s": stop_s, **draw(rng)}]}
-
-    return make
-
-
-def _in_between(name: str, low: float, high: float, **more: Any) -> Callable[[Rng], Values]:
-    return lambda rng: {name: float(rng.uniform(low, high)), **more}
-
-
-def _either_way(name: str, low: float, high: float, **more: Any) -> Callable[[Rng], Values]:
-    return lambda rng: {name: float(rng.uniform(low, high) * rng.choice([-1.0, 1.0])), **more}
+    """One fault, begun when there is a map."""
+    return fault(kind, draw, length_s, start_s=(1.2, 1.5))
 
 
 def _nothing(rng: Rng) -> Values:
@@ -174,8 +172,8 @@ def planted(preset: str = "fast") -> tuple[Planted, ...]:
 
     after = ("after-relocalisation", "new-map", "few-points")
     long_s, rest_s = (0.8, 1.0), (4.0, 5.0)
-    bare = _fault("low-texture", _in_between("gradient_rms", 0.0, 0.1, margin_m=3.0), rest_s)
-    late = _fault("late-images", _in_between("latency_s", 0.03, 0.1), rest_s)
+    bare = _fault("low-texture", in_between("gradient_rms", 0.0, 0.1, margin_m=3.0), rest_s)
+    late = _fault("late-images", in_between("latency_s", 0.03, 0.1), rest_s)
     return (
         row(CLEAN, "", _nothing, never, ""),
         row("dropped-frames, few", "frame-gap", _fault("dropped-frames", _nothing, (0.02, 0.07)), behind, "1…4 images"),
@@ -191,14 +189,14 @@ def planted(preset: str = "fast") -> tuple[Planted, ...]:
             "exposure", *after),
         row("no picture", "lost-exposure", _fault("exposure-jump", _no_picture), during, "black or white frames",
             "exposure", *after),
-        row("motion-blur", "blur", _fast(_fault("motion-blur", _in_between("exposure", 0.8, 1.0))), during,
+        row("motion-blur", "blur", _fast(_fault("motion-blur", in_between("exposure", 0.8, 1.0))), during,
             "0.8…1 of the interval at 10…14 km/h"),
-        row("image-noise", "image-noise", _fault("image-noise", _in_between("noise_grey", 15.0, 30.0)), during,
+        row("image-noise", "image-noise", _fault("image-noise", in_between("noise_grey", 15.0, 30.0)), during,
             "15…30 grey (usual: 2)"),
         row("low-texture", "lost-flat", _fast(bare),
             during, "gradient 0…0.1 grey/px, noise 2 grey", *after),
         row("other place", "lost-unlike", _fault("shift-jump", _elsewhere, (0.5, 0.9)), during, "3…5 m", *after),
-        row("turn-jump", "lost-unlike", _fault("turn-jump", _either_way("turn_rad", 0.6, 1.5), (0.3, 0.6)), during,
+        row("turn-jump", "lost-unlike", _fault("turn-jump", either_way("turn_rad", 0.6, 1.5), (0.3, 0.6)), during,
             "±0.6…1.5 rad", *after),
         row("turning only", "start-failed", _turning, always, "0.5…1.2 rad in 2.5 s, from the start"),
         row("standing still", "start-failed", _standing, always, "from the start"),
