@@ -5,6 +5,7 @@ import tempfile
 from collections.abc import Iterator
 
 import pytest
+from command_line import Shell, caller
 
 
 @pytest.fixture(autouse=True, scope="session")
@@ -13,6 +14,12 @@ def _cache_of_its_own() -> Iterator[None]:
     with tempfile.TemporaryDirectory(prefix="workbench-cache-") as folder, pytest.MonkeyPatch.context() as patch:
         patch.setitem(os.environ, "WORKBENCH_CACHE", folder)
         yield
+
+
+@pytest.fixture
+def shell(capfd: pytest.CaptureFixture[str]) -> Shell:
+    """Runs a command line; exit status, stdout, stderr."""
+    return caller(capfd)
 
 
 @pytest.fixture(scope="session", autouse=True)

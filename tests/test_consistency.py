@@ -9,8 +9,8 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from command_line import Shell
 
-import workbench.cli
 from pipelines.verdict import Verdict
 from readers.streams import RecordingError, ScalarSample
 from workbench import consistency as module
@@ -57,20 +57,6 @@ stop_s = 0.9
 lift_m = 0.02
 ramp_s = 0.3
 """
-Said = tuple[int, str, str]
-Shell = Callable[..., Said]
-
-
-@pytest.fixture
-def shell(capfd: pytest.CaptureFixture[str]) -> Shell:
-    """Run a command line; exit status, stdout, stderr."""
-
-    def call(*arguments: object) -> Said:
-        status = workbench.cli.main([str(argument) for argument in arguments])
-        out, err = capfd.readouterr()
-        return status, out, err
-
-    return call
 
 
 @pytest.fixture(scope="module")

@@ -5,15 +5,14 @@ import math
 import shutil
 import subprocess
 import sys
-from collections.abc import Callable
 from pathlib import Path
 from xml.etree import ElementTree
 
 import numpy as np
 import pandas as pd
 import pytest
+from command_line import Shell
 
-import workbench.cli
 from pipelines.verdict import Severity
 from readers.streams import RecordingError
 from workbench import rrd
@@ -30,20 +29,6 @@ from workbench.sweep import SweepError, parse_axis, unbeaten
 
 FRAMES = 60
 BLURRED = (20, 30)
-Said = tuple[int, str, str]
-Shell = Callable[..., Said]
-
-
-@pytest.fixture
-def shell(capfd: pytest.CaptureFixture[str]) -> Shell:
-    """Run a command line; exit status, stdout, stderr."""
-
-    def call(*arguments: object) -> Said:
-        status = workbench.cli.main([str(argument) for argument in arguments])
-        out, err = capfd.readouterr()
-        return status, out, err
-
-    return call
 
 
 @pytest.fixture(scope="module")

@@ -3,7 +3,6 @@
 import json
 import math
 import shutil
-from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -12,9 +11,9 @@ import fake_semidirect as fake
 import numpy as np
 import pandas as pd
 import pytest
+from command_line import Shell
 from scipy.spatial.transform import Rotation
 
-import workbench.cli
 from pipelines.semidirect.step import SemidirectStep, Stage
 from pipelines.spatial import SpatialPath
 from pipelines.verdict import Verdict
@@ -32,8 +31,6 @@ from workbench.settings import SettingsError
 from workbench.trajectory_files import read_tum
 from workbench.visual_account import in_space
 
-Said = tuple[int, str, str]
-Shell = Callable[..., Said]
 FLIGHT = """
 duration_s = 4.2
 ground = { family = "gravel", metres_per_px = 0.002 }
@@ -75,16 +72,6 @@ def flights(tmp_path_factory: pytest.TempPathFactory) -> Path:
 def flown(file: Path, out: Path, name: str, *overrides: str, **more: Any) -> Any:
     options = {"estimator": "semidirect"} | more
     return run(Request(path=file, out=out, name=name, overrides=(*SMALL, *overrides), **options))
-
-
-@pytest.fixture
-def shell(capfd: pytest.CaptureFixture[str]) -> Shell:
-    def call(*arguments: object) -> Said:
-        status = workbench.cli.main([str(argument) for argument in arguments])
-        out, err = capfd.readouterr()
-        return status, out, err
-
-    return call
 
 
 # ------------------------------------------------------------------------------------ the account
