@@ -24,7 +24,7 @@ from pipelines.semidirect.mapping import Growth, Mapper, Posed
 
 Floats = NDArray[np.float64]
 
-BEHIND = 1
+BEHIND = 3
 """Frames before the last one that the map does not have yet when the next one is tracked."""
 
 

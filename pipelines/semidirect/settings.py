@@ -153,7 +153,7 @@ class SemidirectSettings(CameraSettings):
 
     # how it runs
     mapping: Literal["synchronous", "beside"] = Field(
-        "synchronous", description="the map grows with each frame, or in a thread beside, a frame later"
+        "synchronous", description="the map grows with each frame, or in a thread beside, some frames later"
     )
     stage_times: bool = Field(False, description="log the time of each stage (not reproducible)")
 
