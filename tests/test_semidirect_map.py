@@ -1,5 +1,10 @@
 """The map of the semi-direct odometry: its tables against a plain model, its growth against a known scene."""
 
+import subprocess
+import sys
+import threading
+from pathlib import Path
+
 import cv2
 import numpy as np
 import pytest
@@ -10,7 +15,7 @@ from hypothesis import strategies as st
 from pipelines import lens
 from pipelines.geometry import se3_exp, se3_inverse
 from pipelines.semidirect import local_map, mapping, refinement, relocalisation
-from pipelines.semidirect.beside import Beside
+from pipelines.semidirect.beside import Beside, settled
 from pipelines.semidirect.local_map import Keyframes, LocalMap, PointState, Sightings
 from pipelines.semidirect.mapping import Mapper, Posed
 from pipelines.semidirect.optics import optics_of
@@ -23,6 +28,7 @@ from pipelines.semidirect.tracking import Tracker
 
 SETTINGS = flights.settings()
 OPTICS = optics_of(SETTINGS.camera(flights.WIDTH, flights.HEIGHT))
+ROOT = Path(__file__).parents[1]
 TINY = Pyramid(np.zeros(3, np.uint8), 1, 1)
 
 
@@ -317,39 +323,100 @@ def test_the_farthest_keyframe_goes():
 # ------------------------------------------------------------------------- beside, lost and found
 
 
-def test_mapping_beside_hands_on_errors_and_adjustments():
+SHIFT = se3_exp(np.array([0.1, 0, 0, 0, 0, 0.02]))
+
+
+class Growing:
+    """A mapper that works when it is let, notes the frames it gets, and moves the poses of each."""
+
+    def __init__(self):
+        self.let, self.got = threading.Semaphore(0), []
+
+    def grown(self, world, posed):
+        assert self.let.acquire(timeout=30)
+        self.got.append((posed, threading.current_thread()))
+        if posed.number == 99:
+            raise ValueError("broken on purpose")
+        nothing = dict.fromkeys(mapping.Growth._fields)
+        world = world._replace(next_number=posed.number)
+        return mapping.Growth(**nothing | {"world": world, "shift": SHIFT, "cam_t_world": posed.cam_t_world @ SHIFT})
+
+
+def frame_of(last, number):
+    none = np.zeros(0, np.int64)
+    return Posed(number, last.pyramid, last.cam_t_world, none, np.zeros((0, 2)), none, none, 1.5)
+
+
+def test_mapping_beside_takes_every_frame_in_its_turn_and_hands_on_adjustments():
     _, world, last = grown()
-
-    class Growing:
-        """A mapper whose keyframes are moved by the bundle."""
-
-        def grown(self, world, posed):
-            if posed.number == 99:
-                raise ValueError("broken on purpose")
-            moved = posed.cam_t_world @ se3_exp(np.array([0.1, 0, 0, 0, 0, 0]))
-            nothing = dict.fromkeys(mapping.Growth._fields)
-            return mapping.Growth(**nothing | {"world": world, "keyframe": True, "cam_t_world": moved})
-
-    def posed(number):
-        none = np.zeros(0, np.int64)
-        return Posed(number, last.pyramid, last.cam_t_world, none, np.zeros((0, 2)), none, none, 1.5)
-
     mapper = Growing()
-    beside = Beside(mapper)
-    beside.begin(world)
-    beside.post(posed(50))
-    beside.wait()
-    found = beside.newest()
-    assert found.world is world
-    assert [growth.keyframe for growth in found.growths] == [True]
-    assert np.allclose(found.shift, se3_exp(np.array([0.1, 0, 0, 0, 0, 0])))
-    again = beside.newest()
-    assert np.allclose(again.shift, np.eye(4))  # told once
-    assert again.growths == ()
-    beside.post(posed(99))
-    beside.wait()
+    beside, pending = Beside(mapper), ()
+    for number in (50, 51, 52):
+        pending = beside.posted(world, pending, frame_of(last, number))  # the mapping is stuck: nothing waits for it
+    mapper.let.release(3)
+    poses = [last.cam_t_world @ np.linalg.matrix_power(SHIFT, k) for k in range(4)]
+    for k, number in enumerate((50, 51, 52)):
+        assert np.allclose(pending[0].posed.cam_t_world, poses[k])  # by the map that it grows
+        growth, pending = settled(pending)
+        assert growth.world.next_number == number
+        assert np.allclose(growth.cam_t_world, poses[k + 1])
+    assert pending == ()
+    assert [posed.number for posed, _ in mapper.got] == [50, 51, 52]
+    assert len({thread for _, thread in mapper.got} - {threading.current_thread()}) == 1
+
+
+def test_what_the_mapping_raises_is_raised_for_its_frame_and_those_behind():
+    _, world, last = grown()
+    mapper = Growing()
+    mapper.let.release(3)
+    pending = Beside(mapper).begun(world, [frame_of(last, number) for number in (50, 99, 51)])
+    _, pending = settled(pending)
     with pytest.raises(ValueError, match="on purpose"):
-        beside.newest()
+        settled(pending)
+    with pytest.raises(ValueError, match="on purpose"):
+        pending[1].growth.result(timeout=30)
+    assert [posed.number for posed, _ in mapper.got] == [50, 99]
+
+
+def test_the_thread_ends_when_nobody_holds_the_mapper():
+    _, world, last = grown()
+    mapper = Growing()
+    mapper.let.release()
+    settled(Beside(mapper).posted(world, (), frame_of(last, 50)))
+    thread = mapper.got[0][1]
+    thread.join(timeout=30)
+    assert not thread.is_alive()
+
+
+END = """
+import time
+from pipelines.semidirect.beside import Beside, settled
+
+class Slow:
+    def grown(self, world, posed):
+        time.sleep(0.3)
+        print("mapped", posed, flush=True)
+        return type("Growth", (), {"world": world, "shift": None})
+
+Beside(Slow()).posted(None, (), 7)
+"""
+
+
+def test_the_mapping_ends_its_frame_before_the_interpreter_goes():
+    """A thread that is still within OpenCV's code then aborts the process."""
+    done = subprocess.run([sys.executable, "-c", END], capture_output=True, text=True, timeout=60, cwd=ROOT)
+    assert (done.returncode, done.stdout, done.stderr) == (0, "mapped 7\n", "")
+
+
+def test_shifts_of_many_keyframes_stay_motions():
+    """What a matrix lacks of a rotation must not grow from keyframe to keyframe."""
+    pose, rng = np.eye(4), np.random.default_rng(3)
+    for _ in range(200):
+        adjusted = se3_exp(1e-3 * rng.standard_normal(6)) @ pose
+        shift = mapping.motion_between(pose, adjusted)
+        assert np.abs(pose @ shift - adjusted).max() < 1e-12
+        pose = pose @ shift
+    assert np.abs(pose[:3, :3] @ pose[:3, :3].T - np.eye(3)).max() < 1e-12
 
 
 @pytest.mark.parametrize("angle", [0.0, 0.2])

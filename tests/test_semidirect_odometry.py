@@ -3,6 +3,9 @@
 import dataclasses
 import itertools
 import math
+import threading
+import time
+import zlib
 
 import cv2
 import numpy as np
@@ -11,12 +14,16 @@ import semidirect_flights as flights
 from pydantic import ValidationError
 from scipy.spatial.transform import Rotation
 
+import pipelines.semidirect.odometry
 from pipelines.estimator import EstimatorError, quantities
+from pipelines.semidirect.beside import BEHIND
+from pipelines.semidirect.mapping import Mapper
 from pipelines.semidirect.odometry import SemidirectOdometry
 from pipelines.semidirect.settings import SemidirectSettings
 from pipelines.semidirect.step import Feature, SemidirectStep, Stage
 from pipelines.verdict import Verdict
 from readers.streams import OdometrySample, PoseSample, Problem, RangeSample, StreamKind
+from workbench.checkpoints import decode, encode
 
 FRAMES = 90
 
@@ -329,8 +336,9 @@ def height_sample(t_ns, height_m):
     )  # fmt: skip
 
 
+@pytest.mark.parametrize("mapping", ["synchronous", "beside"])
 @pytest.mark.parametrize("source", ["speed", "position"])
-def test_speed_or_positions_give_the_scale_once_there_is_way(source):
+def test_speed_or_positions_give_the_scale_once_there_is_way(source, mapping):
     centres, _ = flights.way(FRAMES)
     given = []
     for k, picture in enumerate(samples(flights.pictures(FRAMES))):
@@ -346,7 +354,7 @@ def test_speed_or_positions_give_the_scale_once_there_is_way(source):
             ))  # fmt: skip
         given.append(picture)
     stream = {"speed": {"speed_stream": "/odometry"}, "position": {"position_stream": "/truth"}}[source]
-    estimator = SemidirectOdometry(flights.settings(height_m=None, scale_way=0.4, **stream))
+    estimator = SemidirectOdometry(flights.settings(height_m=None, scale_way=0.4, mapping=mapping, **stream))
     steps, _ = flights.flown(estimator, given)
     known = [s.scale_known for s in steps]
     assert 0 in known
@@ -413,18 +421,112 @@ def test_the_log_of_a_frame_fits_together():
     assert timed[[0, 1, 2, 4]].min() > 0
 
 
-def test_mapping_beside_tracking_flies_the_same_way():
-    estimator = SemidirectOdometry(flights.settings(mapping="beside"))
-    state, steps = estimator.start(), []
-    for one in samples(flights.pictures(FRAMES)):
-        state, step = estimator.step(state, one)
-        steps.append(step)
-        if estimator._beside is not None:
-            estimator._beside.wait()  # as when the mapping keeps up: what it does hangs on nothing but the frames
-    assert estimator._beside.dropped == 0
+# ----------------------------------------------------------------------------- mapping beside
+
+
+ACCURATE = {"bundle_keyframes": 5, "max_keyframes": 30}
+
+
+@pytest.mark.parametrize("changes", [{}, ACCURATE], ids=["fast", "accurate"])
+def test_mapping_beside_tracking_flies_the_same_way(changes):
+    steps, alone = flights.flight(FRAMES, mapping="beside", **changes), flights.flight(FRAMES, **changes)
     assert sum(s.stage == Stage.LOST for s in steps) == 0
-    assert flights.path_error(steps)[0] < 5e-3
-    assert steps[-1].map_points > steps[20].map_points
-    assert sum(s.keyframe for s in steps) > 3
-    assert sum(len(s.map_id) > 0 for s in steps) > 3
-    assert sum(s.points_added for s in steps) > 100
+    assert flights.path_error(steps)[0] < 1.2 * flights.path_error(alone)[0]
+    for field in ("keyframe", "points_added", "bundle_iterations"):
+        ours, theirs = (sum(getattr(s, field) for s in flight) for flight in (steps, alone))
+        assert ours == pytest.approx(theirs, rel=0.15)
+    assert [s.frame for s in steps if len(s.map_id)] == [s.frame for s in steps if s.keyframe]
+
+
+class Stumbling(Mapper):
+    """A mapper that takes its time with some frames."""
+
+    def grown(self, world, posed):
+        if posed.number % 7 == 0:
+            time.sleep(0.05)
+        return super().grown(world, posed)
+
+
+def test_what_a_frame_meets_does_not_hang_on_how_fast_the_mapping_is(monkeypatch):
+    monkeypatch.setattr(pipelines.semidirect.odometry, "Mapper", Stumbling)
+    slow, _ = flights.flown(SemidirectOdometry(flights.settings(mapping="beside")), samples(flights.pictures(FRAMES)))
+    for one, other in zip(flights.flight(FRAMES, mapping="beside"), slow, strict=True):
+        same(one, other)
+
+
+class Paused(Mapper):
+    """A mapper that waits until it is let go on."""
+
+    go_on = threading.Event()
+
+    def grown(self, world, posed):
+        assert self.go_on.wait(30)
+        return super().grown(world, posed)
+
+
+def test_tracking_runs_while_the_mapping_works_and_waits_when_it_is_behind(monkeypatch):
+    pictures = samples(flights.pictures(FRAMES)[:40])
+    monkeypatch.setattr(pipelines.semidirect.odometry, "Mapper", Paused)
+    monkeypatch.setattr(Paused, "go_on", threading.Event())
+    estimator = SemidirectOdometry(flights.settings(mapping="beside"))
+    state, tracked = estimator.start(), []
+    done = threading.Event()
+
+    def fly():
+        nonlocal state
+        for one in pictures:
+            state, step = estimator.step(state, one)
+            tracked.append(step.stage)
+        done.set()
+
+    thread = threading.Thread(target=fly)
+    thread.start()
+    try:
+        assert not done.wait(1.0)
+        assert tracked.count(Stage.TRACKED) == BEHIND + 1
+    finally:
+        Paused.go_on.set()
+        thread.join(30)
+    assert done.is_set()
+    assert tracked.count(Stage.LOST) == 0
+
+
+def checksum(*tables):
+    columns = (column for table in tables for column in table if isinstance(column, np.ndarray))
+    return [zlib.crc32(np.ascontiguousarray(column)) for column in columns]
+
+
+@pytest.mark.parametrize("changes", [{}, ACCURATE], ids=["fast", "accurate"])
+def test_neither_thread_writes_to_what_both_read(changes, monkeypatch):
+    shared = []
+
+    class Watching(Mapper):
+        def grown(self, world, posed):
+            tables = (*world[:4], posed, posed.pyramid)
+            shared.append((tables, checksum(*tables)))
+            return super().grown(world, posed)
+
+    monkeypatch.setattr(pipelines.semidirect.odometry, "Mapper", Watching)
+    estimator = SemidirectOdometry(flights.settings(mapping="beside", **changes))
+    flights.flown(estimator, samples(flights.pictures(FRAMES)[:70]))
+    assert len(shared) > 40
+    for tables, before in shared:
+        assert checksum(*tables) == before
+
+
+@pytest.mark.parametrize("stop", [4, 41])
+def test_a_kept_state_goes_on_with_the_mapping_beside(stop):
+    pictures, changes = flights.pictures(FRAMES)[:60], {"mapping": "beside"} | ACCURATE
+    first = SemidirectOdometry(flights.settings(**changes))
+    _, state = flights.flown(first, samples(pictures[:stop]))
+    second = SemidirectOdometry(flights.settings(**changes))
+    kept = decode(encode(first.packed(state)))
+    steps, _ = flights.flown(second, samples(pictures[stop:], stop), second.unpacked(kept, lambda k: pictures[k]))
+    for one, other in zip(steps, flights.flight(FRAMES, **changes)[stop:60], strict=True):
+        same(one, other)
+    alone = SemidirectOdometry(flights.settings(**ACCURATE))
+    steps, state = flights.flown(
+        alone, samples(pictures[stop:], stop), alone.adopted(first.unpacked(kept, pictures.__getitem__))
+    )
+    assert state.pending == ()
+    assert sum(s.stage == Stage.LOST for s in steps) == 0

@@ -1,40 +1,42 @@
 """Mapping in a thread beside tracking. The compiled parts run without the interpreter lock.
 
-The thread takes posed frames one after the other and publishes a new map after each. When it falls behind, only the
-newest frames that wait are kept: a depth filter that misses a frame loses nothing but that measurement. What a frame
-meets in the map depends on the thread's timing, so that a replay differs from time to time; and what the mapping did
-with a frame is told with a later one.
+A frame is tracked in the map as it was `BEHIND` frames before, no older and no newer one: tracking waits for a mapping
+that is slower, and no frame is left out. Which map a frame meets therefore does not depend on the threads' timing, so
+that every run of a log comes out alike.
+
+The threads share arrays that neither writes to: maps and frames are replaced, see `local_map.py`. The thread belongs
+to an executor, which ends it when nobody holds the mapper any more, and lets it finish its frames before the
+interpreter goes: a thread that is stopped within OpenCV's or compiled code takes the whole process down.
 """
 
 from __future__ import annotations
 
-import threading
-from collections import deque
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry import se3_inverse, se3_product
+from pipelines.geometry import se3_product
 from pipelines.semidirect.local_map import LocalMap
 from pipelines.semidirect.mapping import Growth, Mapper, Posed
 
 Floats = NDArray[np.float64]
 
-WAITING = 4
-"""Frames that may wait for the mapping."""
+BEHIND = 3
+"""Frames before the last one that the map does not have yet when the next one is tracked."""
 
 
-class Newest(NamedTuple):
-    """A map; how adjustments moved poses [4, 4] that were found in the map before, T ← T shift; what was done."""
+class Pending(NamedTuple):
+    """A frame that the map does not have yet: its pose is by the map without the frames that wait ahead of it."""
 
-    world: LocalMap
-    shift: Floats
-    growths: tuple[Growth, ...]
+    posed: Posed
+    growth: Future[Growth]
 
 
 class Beside:
-    """A mapper in a thread of its own, which ends with the program.
+    """A mapper in a thread of its own, which takes frames in their order.
 
     Args:
         mapper: what grows the map.
@@ -42,71 +44,38 @@ class Beside:
 
     def __init__(self, mapper: Mapper) -> None:
         self._mapper = mapper
-        self._waiting: deque[Posed] = deque(maxlen=WAITING)
-        self._change = threading.Condition()
-        self._world: LocalMap | None = None
-        self._epoch = 0
-        self._grown: list[tuple[Posed, Growth]] = []
-        self.dropped = 0
-        """Frames that the mapping had no time for."""
-        self._busy = False
-        self._failed: Exception | None = None
-        threading.Thread(target=self._work, name="mapping", daemon=True).start()
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix="mapping")
 
-    def begin(self, world: LocalMap) -> None:
-        """Go on from a map; what waits for the one before is dropped."""
-        with self._change:
-            self._world, self._epoch = world, self._epoch + 1
-            self._waiting.clear()
-            self._grown.clear()
+    def posted(self, world: LocalMap, pending: tuple[Pending, ...], posed: Posed) -> tuple[Pending, ...]:
+        """Give the thread a frame; `pending` are those that grow the map `world` before."""
+        ahead = [one.growth for one in pending]
+        return (*pending, Pending(posed, self._thread.submit(_grown, self._mapper, world, ahead, posed)))
 
-    def post(self, posed: Posed) -> None:
-        """Give a frame to the thread."""
-        with self._change:
-            self.dropped += len(self._waiting) == WAITING
-            self._waiting.append(posed)
-            self._change.notify_all()
+    def begun(self, world: LocalMap, frames: Sequence[Posed]) -> tuple[Pending, ...]:
+        """Give the thread frames that are to grow a map, one after the other."""
+        pending: tuple[Pending, ...] = ()
+        for posed in frames:
+            pending = self.posted(world, pending, posed)
+        return pending
 
-    def newest(self) -> Newest:
-        """The newest map, and what was done to it since this was asked before.
 
-        Raises:
-            Exception: what the mapping raised.
-        """
-        with self._change:
-            if self._failed is not None:
-                raise self._failed
-            assert self._world is not None
-            shift, growths = np.eye(4), tuple(growth for _, growth in self._grown)
-            for posed, growth in self._grown:
-                if growth.keyframe:
-                    by = se3_product(se3_inverse(posed.cam_t_world), growth.cam_t_world)
-                    shift = se3_product(shift, by)
-            self._grown.clear()
-            return Newest(self._world, shift, growths)
+def settled(pending: tuple[Pending, ...]) -> tuple[Growth, tuple[Pending, ...]]:
+    """What the first frame did, waited for; and the others, whose poses follow.
 
-    def wait(self) -> None:
-        """Wait until the frames that were given are mapped, or the mapping has failed."""
-        with self._change:
-            self._change.wait_for(lambda: self._failed is not None or not (self._waiting or self._busy))
+    Raises:
+        Exception: what the mapping raised.
+    """
+    done = pending[0].growth.result()
+    return done, tuple(one._replace(posed=_moved(one.posed, done.shift)) for one in pending[1:])
 
-    def _work(self) -> None:
-        while True:
-            with self._change:
-                self._change.wait_for(lambda: bool(self._waiting))
-                posed, world, epoch = self._waiting.popleft(), self._world, self._epoch
-                self._busy = True
-            assert world is not None
-            try:
-                growth = self._mapper.grown(world, posed)
-            except Exception as error:
-                with self._change:
-                    self._failed = error
-                    self._change.notify_all()
-                return
-            with self._change:
-                self._busy = False
-                if epoch == self._epoch:
-                    self._world = growth.world
-                    self._grown.append((posed, growth))
-                self._change.notify_all()
+
+def _grown(mapper: Mapper, world: LocalMap, ahead: Sequence[Future[Growth]], posed: Posed) -> Growth:
+    """What a frame does to the map, once it has those ahead."""
+    for future in ahead:
+        done = future.result()
+        world, posed = done.world, _moved(posed, done.shift)
+    return mapper.grown(world, posed)
+
+
+def _moved(posed: Posed, shift: Floats) -> Posed:
+    return posed._replace(cam_t_world=se3_product(posed.cam_t_world, shift))

@@ -10,7 +10,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from pipelines.geometry import se3_inverse, se3_product
+from pipelines.geometry import se3_exp, se3_inverse, se3_log, se3_product
 from pipelines.semidirect import depth_filter, epipolar, refinement
 from pipelines.semidirect.features import CornerOptions, corners, occupied_cells
 from pipelines.semidirect.local_map import (
@@ -86,8 +86,9 @@ class Watched(NamedTuple):
 class Growth(NamedTuple):
     """What a frame did to the map.
 
-    `keyframe` says whether it became one, `cam_t_world` [4, 4] its pose after that, `sighted` the points that it sees
-    as a keyframe; `distance` to the nearest keyframe before, over the depth. `removed` [3]: points that went with
+    `keyframe` says whether it became one, `cam_t_world` [4, 4] its pose after that; `shift` [4, 4] is how the bundle
+    moved it, and with it poses that were found in the map before: T ← T shift. `sighted` are the points that it sees as
+    a keyframe; `distance` to the nearest keyframe before, over the depth. `removed` [3]: points that went with
     their keyframe, that were not found again, outliers of the bundle adjustment. `filter_count` [6] by
     `depth_filter.Outcome`, and those given up.
     """
@@ -95,6 +96,7 @@ class Growth(NamedTuple):
     world: LocalMap
     keyframe: bool
     cam_t_world: Floats
+    shift: Floats
     sighted: int
     distance: float
     keyframe_removed: int
@@ -131,13 +133,15 @@ class Mapper:
         distance = nearest_keyframe(world, posed.cam_t_world) / posed.depth
         keyframe = bool(distance > self.settings.keyframe_distance)
         bundle, taking_part, dropped, pose, sighted, refined = None, 0, -1, posed.cam_t_world, 0, 0
+        shift = np.eye(4)
         if keyframe:
             pose, sightings = self._sighted(world, posed)
             sighted = len(sightings.rows)
             world = with_keyframe(world, posed.number, pose, posed.pyramid, sightings)
             if self.settings.bundle_keyframes:
-                world, bundle, taking_part, removed[2] = self._bundled(world)
+                found, (world, bundle, taking_part, removed[2]) = pose, self._bundled(world)
                 pose = world.keyframes.cam_t_world[-1]
+                shift = motion_between(found, pose)
             world, refined = self._refined(world)
             if len(world.keyframes.number) > self.settings.max_keyframes:
                 world, dropped, removed[0] = _without_farthest(world, pose)
@@ -148,6 +152,7 @@ class Mapper:
             world=world,
             keyframe=keyframe,
             cam_t_world=pose,
+            shift=shift,
             sighted=sighted,
             distance=distance,
             keyframe_removed=dropped,
@@ -358,6 +363,15 @@ def covariance_on_ray(ray: Floats, along: Floats, across: Floats) -> Floats:
     """Covariance [n, 3, 3] of points by σ [n] along their unit rays [n, 3] and across: σ∥² f fᵀ + σ⊥² (I - f fᵀ)."""
     on_ray = ray[:, :, None] * ray[:, None, :]
     return np.asarray(along[:, None, None] ** 2 * on_ray + across[:, None, None] ** 2 * (np.eye(3) - on_ray))
+
+
+def motion_between(before: Floats, after: Floats) -> Floats:
+    """The shift [4, 4] with before · shift = after, its rotation orthonormal to the last digit.
+
+    Poses take such shifts again and again: in Rᵀ R' what R lacks of a rotation would stand once more, and each
+    product would treble it.
+    """
+    return se3_exp(se3_log(se3_product(se3_inverse(before), after)))
 
 
 def nearest_keyframe(world: LocalMap, cam_t_world: Floats) -> float:

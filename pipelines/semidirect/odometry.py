@@ -12,7 +12,7 @@ from __future__ import annotations
 import math
 import time
 from dataclasses import dataclass, replace
-from typing import Any, ClassVar, NamedTuple
+from typing import Any, ClassVar, NamedTuple, cast
 
 import numpy as np
 from numpy.typing import NDArray
@@ -21,7 +21,7 @@ from pipelines.correlation.odometry import eight_bit
 from pipelines.estimator import EstimatorError, FrameImage, Images
 from pipelines.geometry import se3_exp, se3_inverse, se3_log, se3_product, wrap_angle
 from pipelines.semidirect import starting
-from pipelines.semidirect.beside import Beside
+from pipelines.semidirect.beside import BEHIND, Beside, Pending, settled
 from pipelines.semidirect.local_map import LocalMap, centre_of, scaled
 from pipelines.semidirect.mapping import Mapper, Posed
 from pipelines.semidirect.optics import optics_of
@@ -74,6 +74,7 @@ class SemidirectState:
 
     Before a map there is `following`, then `world` with the `last` frame whose pose was found; `motion` [4, 4] is the
     last motion between two frames, which took `motion_s`. `held` [4, 4] is the pose that counts now, cam_T_world.
+    `pending` are the frames that a mapping beside has still to grow `world` by.
     `lost_ns` is the time of the first frame that was lost, -1 when not.
     """
 
@@ -82,6 +83,7 @@ class SemidirectState:
     size: tuple[int, int] = (0, 0)
     following: Following | None = None
     world: LocalMap | None = None
+    pending: tuple[Pending, ...] = ()
     last: Known | None = None
     motion: Floats | None = None
     motion_s: float = math.nan
@@ -189,7 +191,10 @@ class SemidirectOdometry:
             first = following.first._replace(pyramid=images)
             images = FrameImage(following.number)
             following = following._replace(first=first, image=images)
-        return replace(state, world=world, last=last, following=following)
+        pending: Any = tuple(
+            one.posed._replace(pyramid=cast("Any", FrameImage(one.posed.number))) for one in state.pending
+        )
+        return replace(state, world=world, pending=pending, last=last, following=following)
 
     def unpacked(self, packed: Any, images: Images) -> SemidirectState:
         """The state that was packed, see `Resumable`.
@@ -212,7 +217,14 @@ class SemidirectOdometry:
         if following is not None:
             first = following.first._replace(pyramid=pyramid(following.first.number))
             following = following._replace(first=first, image=level_image(pyramid(following.number), 0))
-        return replace(packed, world=world, last=last, following=following)
+        pending: tuple[Pending, ...] = ()
+        if packed.pending:
+            frames = [posed._replace(pyramid=pyramid(posed.number)) for posed in cast("Any", packed.pending)]
+            self._for_size(*packed.size)
+            assert self._beside is not None
+            assert world is not None
+            pending = self._beside.begun(world, frames)
+        return replace(packed, world=world, pending=pending, last=last, following=following)
 
     def adopted(self, state: SemidirectState) -> SemidirectState:
         """The state under these settings, see `Resumable`: the map stays, and grows as they say.
@@ -370,8 +382,6 @@ class SemidirectOdometry:
         )
         fields = fields | track_fields(sighted, world) | map_fields(world) | {"keyframe": 1, "accepted": True}
         fields |= dict.fromkeys(("keyframe_points", "points_refined"), len(world.points.number))
-        if self._beside is not None:
-            self._beside.begin(world)
         return Met(new, Stage.STARTED, alarms, fields)
 
     def _scale_at_start(self, state: SemidirectState, unit: float) -> MapScale:
@@ -385,7 +395,7 @@ class SemidirectOdometry:
     def _followed(self, state: SemidirectState, sample: ImageSample, pyramid: Pyramid, clock: _Stopwatch) -> Met:
         """Track a frame by the last one."""
         assert self._tracker is not None
-        state, grown = self._caught_up(state)
+        state, grown = self._caught_up(state, 0 if self._beside is None else BEHIND)
         assert state.world is not None
         assert state.last is not None
         dt_s = (sample.t_ns - state.last.t_ns) * 1e-9
@@ -443,9 +453,9 @@ class SemidirectOdometry:
             np.sort(points.number[looked.rows[np.isin(looked.outcome, MISSED)]]),
             tracked.depth,
         )
-        world, pose = state.world, tracked.cam_t_world
+        world, pending, pose = state.world, state.pending, tracked.cam_t_world
         if self._beside is not None:
-            self._beside.post(posed)
+            pending = self._beside.posted(world, pending, posed)
         else:
             growth = self._mapper.grown(world, posed)
             world, pose = growth.world, growth.cam_t_world
@@ -459,6 +469,7 @@ class SemidirectOdometry:
         new = replace(
             state,
             world=world,
+            pending=pending,
             last=last,
             motion=motion,
             motion_s=motion_s,
@@ -469,17 +480,17 @@ class SemidirectOdometry:
         new = self._scaled(new, sample.t_ns)
         return Met(new, stage, alarms | self._scale_alarms(new, fields), fields | {"accepted": True})
 
-    def _caught_up(self, state: SemidirectState) -> tuple[SemidirectState, dict[str, Any]]:
-        """The state with the newest map of the thread beside, if there is one; and what it did, for the log."""
-        if self._beside is None or state.last is None:
-            return state, {}
-        newest = self._beside.newest()
-        pose = se3_product(state.last.cam_t_world, newest.shift)
-        now = replace(state, world=newest.world, last=state.last._replace(cam_t_world=pose), held=pose)
-        keyframes = [growth for growth in newest.growths if growth.keyframe]
-        if not newest.growths:
-            return now, {}
-        return now, growth_fields((keyframes or newest.growths)[-1]) | (map_fields(newest.world) if keyframes else {})
+    def _caught_up(self, state: SemidirectState, left: int) -> tuple[SemidirectState, dict[str, Any]]:
+        """The state whose map has all but the last few pending frames; and what the last of those did, for the log."""
+        fields: dict[str, Any] = {}
+        while len(state.pending) > left:
+            growth, pending = settled(state.pending)
+            assert state.last is not None
+            pose = se3_product(state.last.cam_t_world, growth.shift)
+            last = state.last._replace(cam_t_world=pose)
+            state = replace(state, world=growth.world, pending=pending, last=last, held=pose)
+            fields = growth_fields(growth) | (map_fields(growth.world) if growth.keyframe else {})
+        return state, fields
 
     def _known(
         self, number: int, t_ns: int, pyramid: Pyramid, pose: Floats, sighted: Tracked, world: LocalMap
@@ -507,12 +518,13 @@ class SemidirectOdometry:
         if state.motion is not None:
             motion = state.motion.copy()
             motion[:3, 3] *= found.metres
-        world = scaled(state.world, found.metres, about)
+        world, pending = scaled(state.world, found.metres, about), state.pending
         if self._beside is not None:
-            self._beside.begin(world)
+            pending = self._beside.begun(world, [_scaled_frame(one.posed, found.metres, about) for one in pending])
         return replace(
             state,
             world=world,
+            pending=pending,
             last=state.last._replace(cam_t_world=pose),
             held=pose,
             motion=motion,
@@ -535,7 +547,7 @@ class SemidirectOdometry:
     def _searched(self, state: SemidirectState, sample: ImageSample, pyramid: Pyramid, clock: _Stopwatch) -> Met:
         """Look for a lost camera by the keyframes; begin a new map when that has failed for long."""
         assert self._tracker is not None
-        s, (state, grown) = self._settings, self._caught_up(state)
+        s, (state, grown) = self._settings, self._caught_up(state, max(len(state.pending) - 1, 0))
         assert state.world is not None
         assert state.last is not None
         found = relocalised(self._tracker, state.world, pyramid, state.last.cam_t_world, s.relocalise_correlation)
@@ -547,7 +559,9 @@ class SemidirectOdometry:
                 new, sample, pyramid, found.tracked, Stage.RELOCALISED, Verdict.RELOCALISED, fields, clock
             )
         if s.restart_s > 0 and (sample.t_ns - state.lost_ns) * 1e-9 >= s.restart_s:
-            met = self._starting(replace(state, world=None, last=None, following=None, lost_ns=-1), sample, pyramid)
+            met = self._starting(
+                replace(state, world=None, pending=(), last=None, following=None, lost_ns=-1), sample, pyramid
+            )
             return met._replace(alarms=met.alarms | Verdict.LOST)
         return Met(state, Stage.LOST, Verdict.LOST, fields)
 
@@ -656,6 +670,11 @@ def _scaled_pose(cam_t_world: Floats, factor: float, about: Floats) -> Floats:
     moved = cam_t_world.copy()
     moved[:3, 3] = -moved[:3, :3] @ (about + factor * (centre_of(cam_t_world) - about))
     return moved
+
+
+def _scaled_frame(posed: Posed, factor: float, about: Floats) -> Posed:
+    """A frame for a map whose lengths are multiplied by a factor, `about` [3] staying."""
+    return posed._replace(cam_t_world=_scaled_pose(posed.cam_t_world, factor, about), depth=posed.depth * factor)
 
 
 def _convincing(tracked: Tracked, settings: SemidirectSettings) -> bool:

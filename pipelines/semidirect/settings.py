@@ -157,7 +157,7 @@ class SemidirectSettings(CameraSettings):
 
     # how it runs
     mapping: Literal["synchronous", "beside"] = Field(
-        "synchronous", description="the map grows with each frame, or in a thread beside (not reproducible)"
+        "synchronous", description="the map grows with each frame, or in a thread beside, some frames later"
     )
     stage_times: bool = Field(False, description="log the time of each stage (not reproducible)")
 
