@@ -39,6 +39,7 @@ from readers.streams import (
     array,
 )
 from tests.toys import ToyRecording
+from workbench import manifest
 from workbench.cli import main
 from workbench.rrd import SensorWriter
 from workbench.rrd_sensors import SensorReader
@@ -373,6 +374,7 @@ def test_the_command(walked: dict[str, Path], tmp_path: Path, capsys: pytest.Cap
     kept = read_fields(folder / "best.whatif-wide.rrd", "best.whatif-wide", type(answer.steps[0]), ["frame", "pose"])
     assert kept["frame"] == [10, 11, 12, 13]
     np.testing.assert_array_equal(kept["pose"], [step.pose for step in answer.steps])
+    assert not any(check.problems for check in manifest.verify(folder, "best.whatif-wide"))
     (folder / "paper-a.toml").unlink()
     assert len(same(folder, 10, 14).rows) == 4  # one run, what-ifs not counted
 

@@ -650,8 +650,7 @@ class _Session:
             self._write_toml({"complete": False, "summary": {"interrupted": True}})
             raise
         self._write_toml({"complete": True, "summary": summary})
-        made = manifest.taken(self.folder, self.name, writers.rows)
-        _replace(manifest.file_of(self.folder, self.name), made.text())
+        manifest.write(self.folder, self.name, manifest.taken(self.folder, self.name, writers.rows))
         return Outcome(self.folder, self._file("rrd"), self.folder / "sensors.rrd", summary)
 
     def _make_folder(self) -> None:

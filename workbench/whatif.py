@@ -23,7 +23,7 @@ from pipelines.planar import wrap_angle
 from pipelines.replay import stepped
 from pipelines.verdict import Verdict, flags
 from readers.streams import RecordingError, Sample, StreamError
-from workbench import checkpoints
+from workbench import checkpoints, manifest
 from workbench.runs import Run, open_run
 from workbench.schema import CLOCKED, Archetype, schema_of
 from workbench.settings import (
@@ -602,7 +602,9 @@ def _value(value: Any) -> str:
 
 
 def write(answer: Answer) -> None:
-    """Write the new steps as a run of its own beside the old one: the recording, and its TOML.
+    """Write the new steps as a run of its own beside the old one: the recording, its TOML, and its manifest.
+
+    That knows of the sensors' file what the old run's manifest knows.
 
     Raises:
         WorkbenchError: they cannot be written.
@@ -633,3 +635,5 @@ def write(answer: Answer) -> None:
     part = run.folder / f"{answer.name}.toml.part"
     part.write_text(to_toml(values), encoding="utf-8")
     part.replace(run.folder / f"{answer.name}.toml")
+    known = manifest.read(run.folder, run.name) if manifest.file_of(run.folder, run.name).is_file() else None
+    manifest.write(run.folder, answer.name, manifest.taken(run.folder, answer.name, known=known))
