@@ -182,3 +182,5 @@ def test_the_command_tells_and_has_its_status(copy: Path, capsys: pytest.Capture
     (copy / "best.sha256").unlink()
     assert main(["verify", str(copy / "best.rrd")]) == 2
     assert "no manifest" in capsys.readouterr().err
+    assert main(["verify", str(copy / "nothere")]) == 2
+    assert "nothere: there is no such run" in capsys.readouterr().err

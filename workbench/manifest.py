@@ -95,7 +95,10 @@ def runs_of(path: Path) -> list[tuple[Path, str]]:
     """
     if not path.is_dir():
         known = path.suffix.removeprefix(".") in (*SUFFIXES, "sha256")
-        return [(path.parent, path.stem if known else path.name)]
+        name = path.stem if known else path.name
+        if not any((path.parent / f"{name}.{suffix}").is_file() for suffix in (*SUFFIXES, "sha256")):
+            raise RecordingError(path, "there is no such run", "give the folder or the RUN.rrd of a replay")
+        return [(path.parent, name)]
     files = [*path.glob("*.sha256"), *path.glob("*.toml")]
     names = sorted({file.stem for file in files} - {Path(SENSORS).stem})
     if not names:
