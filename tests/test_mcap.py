@@ -1,10 +1,11 @@
 """MCAP files: every compression, layout and encoding, Foxglove's types, and every kind of damage."""
 
 import base64
+import itertools
 import json
 import math
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -18,7 +19,7 @@ from rosbags.highlevel import AnyReader, AnyReaderError
 
 from readers import open_recording
 from readers.clock import survey
-from readers.message_log import Source, in_log_order
+from readers.message_log import Channel, Message, Source, in_log_order
 from readers.messages import Arrival, reader_of, samples_of
 from readers.streams import CameraInfo, ImageSample, PoseSample, Problem, Recording, StreamKind
 
@@ -112,6 +113,19 @@ def test_sources_are_opened_when_their_time_has_come() -> None:
     merged = in_log_order(source(i) for i in range(3))
     assert list(merged) == []
     assert raws == [0, 1, 2]
+
+
+def test_no_more_sources_are_made_than_are_come_to() -> None:
+    made: list[int] = []
+
+    def sources() -> Iterator[Source]:
+        for number in range(100):
+            made.append(number)
+            message = Message(number * 10, Channel("/a", "", ""), b"")
+            yield Source(number * 10, lambda message=message: iter([message]), number * 10 + 5)  # type: ignore[misc]
+
+    assert [message.log_ns for message in itertools.islice(in_log_order(sources()), 3)] == [0, 10, 20]
+    assert made == [0, 1, 2, 3]
 
 
 def test_memory_does_not_grow_with_the_file(tmp_path: Path) -> None:
