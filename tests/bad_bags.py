@@ -312,15 +312,19 @@ def write_ahead(folder: Path) -> Path:
     return _left_behind(folder, "-wal", "PRAGMA journal_mode = WAL", "PRAGMA wal_autocheckpoint = 0")
 
 
+def _rewrite(file: Path, change: Callable[[bytearray], Any]) -> None:
+    """Change the bytes of a file where they are, or put what `change` gives in their place."""
+    data = bytearray(file.read_bytes())
+    result = change(data)
+    file.write_bytes(data if result is None else result)
+
+
 def torn_log(change: Callable[[bytearray], Any]) -> Callable[[Path], Path]:
     """The same, with the write-ahead log damaged: SQLite leaves out what follows, without a word."""
 
     def make(folder: Path) -> Path:
         path = write_ahead(folder)
-        log = path.with_name(path.name + "-wal")
-        data = bytearray(log.read_bytes())
-        result = change(data)
-        log.write_bytes(data if result is None else result)
+        _rewrite(path.with_name(path.name + "-wal"), change)
         return path
 
     return make
@@ -381,9 +385,7 @@ def _left_behind(folder: Path, end: str, *pragmas: str) -> Path:
 def pages(change: Callable[[bytearray], Any]) -> Callable[[Path], Path]:
     def make(folder: Path) -> Path:
         path = database(folder)
-        data = bytearray(path.read_bytes())
-        result = change(data)
-        path.write_bytes(data if result is None else result)
+        _rewrite(path, change)
         return path
 
     return make

@@ -271,9 +271,7 @@ def test_a_plot_that_would_be_empty_is_left_out(tmp_path: Path, monkeypatch: pyt
     assert "Bundle" not in left["Keyframes"]
     assert everything["Times"] == ["Time of the stages, ms"]
     assert left["Times"] == []
-    assert (
-        "stage_times=true" in fixed(tmp_path / "run.rrd", "/runs/fast/semidirect/work/untimed", "TextDocument:text")[0]
-    )
+    assert "stage_times=true" in fixed(tmp_path / "run.rrd", "/runs/fast/semidirect/untimed", "TextDocument:text")[0]
 
 
 def fixed(path: Path, entity: str, component: str) -> Any:

@@ -488,7 +488,7 @@ def _visual_plots(root: str, bounds: Bounds, *, semidirect: bool) -> rrb.Tabs:
         elif loud:
             tabs.append(rrb.Horizontal(*(view(plot, top=top) for plot in loud), name=tab))
         elif tab == _TIMES:
-            tabs.append(rrb.TextDocumentView(origin=f"{root}/work/untimed", name=tab))
+            tabs.append(rrb.TextDocumentView(origin=f"{root}/untimed", name=tab))
     return rrb.Tabs(*tabs)
 
 

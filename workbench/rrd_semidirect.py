@@ -67,7 +67,7 @@ class VisualDrawing(Drawing):
         names = list(visual.STAGE_NAMES)
         colours = [STAGE_COLOURS[stage] for stage in Stage]
         self.file.static(f"{self.root}/stage", rr.StateConfiguration(values=names, labels=names, colors=colours))
-        self.file.static(f"{self.root}/work/untimed", document(UNTIMED))
+        self.file.static(f"{self.root}/untimed", document(UNTIMED))
         self.file.static(f"{self.root}/features/error", rr.SeriesLines(names=["median [px]", "90 % [px]"]))
 
     def legends(self, table: traces.Columns) -> Mapping[str, Any]:  # noqa: D102

@@ -571,7 +571,7 @@ end, then the next one that starts.
 | `/runs/RUN/ESTIMATOR/features/error` | median and 90 % quantile of the reprojection error (px of the level) |
 | `/runs/RUN/ESTIMATOR/alignment/level`, `/iterations` | cost before and after (grey²), and iterations, of each level |
 | `/runs/RUN/ESTIMATOR/prior/correction` | way from the prior to the aligned position, and to the final one (m) |
-| `/runs/RUN/ESTIMATOR/work/untimed` | how the stages' times are asked for; shown where they were not |
+| `/runs/RUN/ESTIMATOR/untimed` | how the stages' times are asked for; shown where they were not |
 | `/runs/RUN/ESTIMATOR/filters/spread` | medians over the filters of σ/z_range and of a/(a+b) |
 | `/runs/RUN/ESTIMATOR/filters/shown/K/depth` | μ, μ ± σ (1/m) of the filter that slot K follows, 1 to 8 |
 | `/runs/RUN/ESTIMATOR/filters/shown/K/ratio`, `/number` | its a/(a+b) and C1; its number |
